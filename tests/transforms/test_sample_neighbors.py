@@ -26,9 +26,9 @@ def searches(monkeypatch):
     asked = []
     search = knn._search_cloud
 
-    def counted(points, rows, order, start, reach, indices, valid):
+    def counted(points, rows, order, start, indices):
         asked.append(indices.shape[1])
-        search(points, rows, order, start, reach, indices, valid)
+        search(points, rows, order, start, indices)
 
     monkeypatch.setattr(knn, "_search_cloud", counted)
     return asked

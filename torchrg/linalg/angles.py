@@ -112,12 +112,12 @@ _ASIN_SERIES = _asin_series(_ASIN_DEGREE)
 
 def above(values: Tensor, bounds: Tensor | float) -> Tensor:
     """Return 1 where values exceed their bounds, else 0, in their dtype, without gradient."""
-    return torch.gt(values.detach(), bounds, out=torch.empty_like(values, requires_grad=False))
+    return (values.detach() > bounds).to(values.dtype)
 
 
 def at_most(values: Tensor, bounds: Tensor | float) -> Tensor:
     """Return 1 where values are at most their bounds, else 0; see :func:`above`."""
-    return torch.le(values.detach(), bounds, out=torch.empty_like(values, requires_grad=False))
+    return (values.detach() <= bounds).to(values.dtype)
 
 
 def signs(values: Tensor) -> Tensor:

@@ -205,15 +205,8 @@ class Segments:
 
     def gather_centered(self, vectors: Tensor, centers: Tensor) -> list[Tensor]:
         """Apply :meth:`gather` to vectors ``(N, 3)``, relative to region centers ``(M, 3)``."""
-        if self.are_served(centers) and vectors.dtype in _COORDINATE_KERNELS:
-            eye = torch.eye(3, dtype=torch.float64, device=centers.device)
-            return self.coordinates(vectors, centers, eye.expand(len(centers), 3, 3))
         pairs = zip(vectors.unbind(dim=1), centers.unbind(dim=1), strict=True)
         return [self.gather(column).double() - self.broadcast(center) for column, center in pairs]
-
-    def spread_columns(self, vectors: Tensor) -> list[Tensor]:
-        """Apply :meth:`broadcast` to the columns of vectors ``(M, 3)``."""
-        return [self.broadcast(column) for column in vectors.unbind(dim=1)]
 
     def sum(self, values: Tensor) -> Tensor:
         """Return the sum of the values of each region, given in the order of :meth:`gather`."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -106,12 +105,11 @@ def search_knn(
             "Lower k or pass a larger cloud."
         )
     indices = scratch.empty((len(coordinates), k), np.int32)
-    is_far = None if max_distance is None else np.empty(indices.shape, dtype=bool)
     for start, stop in bounds:
         cloud = coordinates[start:stop]
         order = None if canonical else canonical_order(cloud).numpy()
         cloud = cloud if order is None else cloud[order]
-        if scratch.is_active() and max_distance is None:
+        if scratch.is_active():
             lists = indices[start:stop]
             found = lists if order is None else scratch.empty(lists.shape, np.int32)
             search_blocks(cloud, search_rows, found)
@@ -121,17 +119,24 @@ def search_knn(
             if start:
                 lists += start
             continue
-        _search_cloud(
-            cloud,
-            slice(0, len(cloud)),
-            order,
-            start,
-            math.inf if max_distance is None else max_distance,
-            indices[start:stop],
-            None if is_far is None else is_far[start:stop],
-        )
-    valid = None if is_far is None else torch.from_numpy(~is_far).to(tensor.device)
-    return Neighbors(torch.from_numpy(indices).to(tensor.device), valid)
+        _search_cloud(cloud, slice(0, len(cloud)), order, start, indices[start:stop])
+    columns = [indices]
+    if max_distance is not None:
+        columns.append(_drop_far_neighbors(coordinates, indices, max_distance))
+    return Neighbors(*(torch.from_numpy(column).to(tensor.device) for column in columns))
+
+
+def _drop_far_neighbors(
+    points: NDArray[np.floating], indices: NDArray[np.int32], max_distance: float
+) -> NDArray[np.bool_]:
+    """Replace far neighbors ``(N, k)`` by the point itself, and return a mask of the others."""
+    is_near = np.empty(indices.shape, dtype=bool)
+    for rows in split_rows(len(points), limit_rows(ROWS_IN_CACHE, indices.shape[1])):
+        positions = points[indices[rows]].astype(np.float64)
+        distances = np.linalg.norm(positions - positions[:, :1], axis=2)
+        is_near[rows] = distances <= max_distance
+        indices[rows] = np.where(is_near[rows], indices[rows], indices[rows, :1])
+    return is_near
 
 
 def search_distinct(points: Tensor, k: int, *, max_distance: float | None = None) -> Neighbors:
@@ -281,7 +286,7 @@ def search_rows(
 
     ``numbers`` ``(n,)`` are the rows of the points in the lists.
     """
-    _search_cloud(points, rows, numbers, 0, math.inf, indices, None)
+    _search_cloud(points, rows, numbers, 0, indices)
 
 
 def _search_cloud(
@@ -289,9 +294,7 @@ def _search_cloud(
     query_rows: slice,
     order: NDArray[np.int64] | None,
     first_row: int,
-    max_distance: float,
     indices: NDArray[np.int32],
-    is_far: NDArray[np.bool_] | None,
 ) -> None:
     """Search one cloud in canonical order and write results in the caller's order.
 
@@ -305,20 +308,11 @@ def _search_cloud(
     starts = np.flatnonzero(mark_distinct(*columns).numpy())
     positions = (points if len(starts) == len(points) else points[starts]).astype(np.float64)
 
-    def store(
-        queried: NDArray[np.integer], distances: NDArray[np.float64], nearest: NDArray[np.integer]
-    ) -> None:
-        rows = queried
+    def store(rows: NDArray[np.integer], nearest: NDArray[np.integer]) -> None:
         if len(positions) < len(points):
-            bounds = np.append(starts, len(points))
-            rows, distances, nearest = _restore_duplicates(queried, distances, nearest, bounds, k)
-        if is_far is not None:
-            too_far = distances > max_distance
-            nearest = np.where(too_far, rows[:, None], nearest)
+            rows, nearest = _restore_duplicates(rows, nearest, np.append(starts, len(points)), k)
         target = rows if order is None else order[rows]
         indices[target] = (nearest if order is None else order[nearest]) + first_row
-        if is_far is not None:
-            is_far[target] = too_far
 
     width = min(k, len(positions))
     tree = cKDTree(positions, balanced_tree=False, compact_nodes=False)
@@ -327,21 +321,16 @@ def _search_cloud(
     if len(positions) >= _MIN_FOR_CELLS and kernels.serve(k=k):
         sample = positions[pending[:: -(-len(pending) // _SAMPLE_SIZE)]]
         reach = tree.query(sample, [k])[0][:, 0]
-        if len(positions) == len(points) and is_far is None:
+        if len(positions) == len(points):
             pending = search_cells(positions, pending, reach, indices, order, first_row)
         else:
             found, requested = np.empty((len(positions), k), dtype=np.int32), pending
             pending = search_cells(positions, requested, reach, found)
             resolved = np.setdiff1d(requested, pending, assume_unique=True)
             for chunk in split_rows(len(resolved), limit_rows(ROWS_IN_CACHE, k)):
-                rows = resolved[chunk]
-                near = found[rows]
-                distances = np.broadcast_to(0.0, near.shape)
-                if is_far is not None:
-                    distances = np.linalg.norm(positions[near] - positions[rows, None], axis=2)
-                store(rows, distances, near)
+                store(resolved[chunk], found[resolved[chunk]])
     for chunk in split_rows(len(pending), limit_rows(CHUNK_SIZE, width)):
-        store(pending[chunk], *_query(tree, positions[pending[chunk]], width))
+        store(pending[chunk], _query(tree, positions[pending[chunk]], width)[1])
 
 
 def search_cells(
@@ -437,11 +426,10 @@ def _query(
 
 def _restore_duplicates(
     queried: NDArray[np.integer],
-    distances: NDArray[np.float64],
     nearest: NDArray[np.integer],
     starts: NDArray[np.int64],
     k: int,
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Expand positions to their points: query rows, and the k nearest, the point itself first.
 
     ``starts`` ``(P + 1,)`` are the first points of the positions, and the number of points.
@@ -451,17 +439,16 @@ def _restore_duplicates(
     taken = np.diff(before, axis=1, prepend=0).ravel()
     position = np.arange(len(nearest) * k) - np.repeat(np.cumsum(taken) - taken, taken)
     points = (np.repeat(starts[nearest.ravel()], taken) + position).reshape(len(nearest), k)
-    far = np.repeat(distances.ravel(), taken).reshape(len(nearest), k)
     owner = np.repeat(np.arange(len(queried)), counts[queried])
     rank = np.arange(len(owner)) - np.searchsorted(owner, owner)
     rows = starts[queried][owner] + rank
-    points, far = points[owner], far[owner]
+    points = points[owner]
     later = np.flatnonzero(rank)
     if len(later):
         shift = np.arange(k) <= rank[later, None]
         points[later] = np.where(shift, np.roll(points[later], 1, axis=1), points[later])
         points[later, 0] = rows[later]
-    return rows, far, points
+    return rows, points
 
 
 def gather_patches(points: Tensor, indices: Tensor) -> Tensor:
@@ -470,15 +457,7 @@ def gather_patches(points: Tensor, indices: Tensor) -> Tensor:
     ``indices`` ``(n, K)`` are rows of the points ``(N, 3)``, the point itself first. Each
     coordinate is contiguous in memory, so that ``patches.unbind(-1)`` gives fast columns.
     """
-    flat = indices.reshape(-1)
-    if points.requires_grad and torch.is_grad_enabled():
-        gathered = points.index_select(0, flat).view(*indices.shape, 3)
-        return gathered - gathered[:, :1]
-    patches = points.new_empty((3, *indices.shape))
-    for axis in range(3):
-        column = points[:, axis].index_select(0, flat).view(indices.shape)
-        torch.sub(column, column[:, :1], out=patches[axis])
-    return patches.movedim(0, -1)
+    return torch.stack(gather_columns(points, indices)).movedim(0, -1)
 
 
 def gather_columns(points: Tensor, indices: Tensor) -> tuple[Tensor, Tensor, Tensor]:

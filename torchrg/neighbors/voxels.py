@@ -10,6 +10,7 @@ from torch import Tensor
 from torchrg import scratch
 from torchrg._checks import as_tensor, check_points, is_positive
 from torchrg.errors import ConfigError
+from torchrg.neighbors.order import mark_distinct
 from torchrg.structures import UNLABELED, AnyCloud
 from torchrg.structures.points import short_repr
 
@@ -86,9 +87,7 @@ def _first_by_coordinates(chosen: Tensor, voxel: Tensor, columns: Sequence[Tenso
     x, y, z = (column[chosen].cpu().numpy() for column in columns)
     order = torch.from_numpy(np.lexsort((z, y, x, voxel[chosen].cpu().numpy()))).to(voxel.device)
     chosen = chosen[order]
-    is_first = torch.ones_like(chosen, dtype=torch.bool)
-    is_first[1:] = voxel[chosen[1:]] != voxel[chosen[:-1]]
-    return chosen[is_first]
+    return chosen[mark_distinct(voxel[chosen])]
 
 
 def cell_keys(cells: Sequence[Tensor]) -> Tensor:

@@ -88,14 +88,6 @@ def segment_cloud(
         FormatError: If no point is finite, or ``within`` is not a field of integers.
         ConfigError: If normals are oriented by viewpoint and the cloud has no scanner positions, or
             if there is not enough memory for settings above their defaults.
-
-    Example:
-        >>> from torchrg.config import load_config
-        >>> from torchrg.scenes import make_room
-        >>> cloud = Cloud(make_room(2000).points.numpy())
-        >>> seg, superpoints = segment_cloud(cloud, load_config("classic"))
-        >>> len(seg.labels), superpoints
-        (2000, None)
     """
     for note in check_finite(cloud):
         warn(note)

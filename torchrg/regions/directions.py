@@ -11,6 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchrg.linalg.moments import dot
+
 MAX_TILT = math.radians(15.0)
 """Maximum angle of floors and ceilings to horizontal, and of walls to vertical, in radians."""
 MAX_ANGLE = math.radians(3.0)
@@ -33,18 +35,12 @@ faces the third axis. The walls of corridors and streets reach 1.5."""
 
 def are_horizontal(normals: Tensor, up: Tensor, max_tilt: float = MAX_TILT) -> Tensor:
     """Return which unit normals ``(M, 3)`` are of horizontal planes, shape ``(M,)``."""
-    return along(normals.double(), up).abs() >= math.cos(max_tilt)
+    return dot(normals.double(), up).abs() >= math.cos(max_tilt)
 
 
 def are_vertical(normals: Tensor, up: Tensor, max_tilt: float = MAX_TILT) -> Tensor:
     """Return which unit normals ``(M, 3)`` are of vertical planes, shape ``(M,)``."""
-    return along(normals.double(), up).abs() <= math.sin(max_tilt)
-
-
-def along(vectors: Tensor, axis: Tensor) -> Tensor:
-    """Return the coordinates of vectors ``(N, 3)`` along an axis."""
-    x, y, z = vectors.unbind(dim=1)
-    return x * axis[0] + y * axis[1] + z * axis[2]
+    return dot(normals.double(), up).abs() <= math.sin(max_tilt)
 
 
 def horizontal_toward(direction: Tensor, up: Tensor) -> Tensor:

@@ -159,7 +159,9 @@ def accept_edges(
             "pass_edges", *columns, cloud.valid, cloud.reach, *near, ids, *limits, signed
         )
     else:
-        joins = are_valid(near, ids, cloud.valid)
+        # An edge joins two different valid points.
+        joins = near.gather(cloud.valid) & cloud.valid[ids, None] & (near.indices != ids[:, None])
+        joins &= near.mask()
         if angle is not None:
             joins &= within_angle(near, ids, columns[1], angle, signed=signed)
         if distance is not None:
@@ -181,13 +183,6 @@ def accept_edges(
         if config.connectivity_scope == "region":
             joins &= connected
     return joins, connected
-
-
-def are_valid(near: Neighbors, rows: Tensor, valid: Tensor) -> Tensor:
-    """Return a mask of the edges between two different valid points."""
-    passed = near.gather(valid) & valid[rows][:, None]
-    passed &= near.indices != rows[:, None]
-    return passed if near.valid is None else passed & near.valid
 
 
 def within_angle(

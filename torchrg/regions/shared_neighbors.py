@@ -53,7 +53,10 @@ class SharedNeighbors:
             return candidates.clone()
         k = candidates.shape[1]
         if k <= _MAX_IN_KERNEL and kernels.serve(*self._neighbors, candidates, k=k):
-            column_of = self._buffer()
+            try:
+                column_of = self._buffers.pop()
+            except IndexError:
+                column_of = torch.zeros(len(self._neighbors.indices), dtype=torch.int32)
             edges = *self._neighbors, candidates, column_of, rows.start, self._min_shared
             (joined,) = kernels.call("connected", *edges)
             self._buffers.append(column_of)
@@ -73,27 +76,13 @@ class SharedNeighbors:
 
     def _count(self, start: int, stop: int) -> Tensor:
         """Return the number of common neighbors along all edges of a block, shape ``(n, K)``."""
-        lists, column_of = self._neighbors.indices[start:stop].long(), self._buffer()
-        members = lists.flatten()
-        new_columns = torch.arange(len(members), dtype=column_of.dtype, device=column_of.device)
-        column_of[members] = new_columns
-        members = members[column_of[members] == new_columns]
-        column_of[members] = new_columns[: len(members)]
+        members, lists = torch.unique(self._neighbors.indices[start:stop], return_inverse=True)
         near = self._neighbors.select(members)
-        columns = column_of[near.indices.long()].long().clamp(max=len(members) - 1)
+        columns = torch.searchsorted(members, near.indices).clamp(max=len(members) - 1)
         counted = (members[columns] == near.indices) & near.mask()
         occurs = torch.zeros(len(members), len(members) + 1, device=members.device)
         # Non-members are scattered into an extra last column.
         occurs.scatter_(1, torch.where(counted, columns, len(members)), 1.0)
         occurs = occurs[:, :-1]
-        shared = (occurs[column_of[start:stop]] @ occurs.T).gather(1, column_of[lists].long())
-        self._buffers.append(column_of)
-        return shared
-
-    def _buffer(self) -> Tensor:
-        """Return a buffer with one integer per point, reusing an earlier one if available."""
-        try:
-            return self._buffers.pop()
-        except IndexError:
-            indices = self._neighbors.indices
-            return torch.zeros(len(indices), dtype=torch.int32, device=indices.device)
+        # Each point is the first in its list.
+        return (occurs[lists[:, 0]] @ occurs.T).gather(1, lists)

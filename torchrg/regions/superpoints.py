@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import NamedTuple
 
@@ -24,6 +24,7 @@ from torchrg.regions.edges import neighborhood_radii
 from torchrg.regions.fit import fit_planes, mean_normals
 from torchrg.regions.growth import rank_by_count
 from torchrg.regions.splits import connected_points
+from torchrg.robust.lanes import sum_products, sum_squares
 from torchrg.structures import UNLABELED, Neighbors, Sampling, Superpoints
 
 _NUM_MEASURED = 50
@@ -207,7 +208,9 @@ def _partition_distinct(
     if neighbors is None or neighbors.indices.shape[1] < k:
         neighbors = search_knn(positions, k, canonical=True)
     neighbors = Neighbors(neighbors.indices[:, :k].cpu())
-    spacing = _median_spacing(positions, neighbors)
+    # The points are assumed to be evenly spread.
+    radii = neighborhood_radii(positions.double(), neighbors)
+    spacing = float(radii.median()) / _RADIUS_SPACINGS
     normals = _blend_with_planes(normals, labels)
     if colors is not None:
         colors = math.sqrt(_COLOR_WEIGHT) * colors
@@ -215,7 +218,9 @@ def _partition_distinct(
     nearest = nearest if edges is None else _edge_lists(edges, len(positions))
     regions = torch.arange(len(positions))
     if config.planes == "whole":
-        regions = _plane_components(labels, nearest)
+        parts = Segments(connected_points(labels, nearest))
+        regions[parts.rows] = parts.broadcast(parts.first(regions))
+        regions = torch.unique(regions, return_inverse=True)[1]
     bound = math.inf if config.max_extent is None else config.max_extent
     graphs = [
         _Graph(
@@ -301,19 +306,6 @@ class _Graph(NamedTuple):
     boundaries: _Boundaries
 
 
-def _median_spacing(positions: Tensor, neighbors: Neighbors) -> float:
-    """Return the median point spacing, assuming evenly spread points."""
-    return float(neighborhood_radii(positions.double(), neighbors).median()) / _RADIUS_SPACINGS
-
-
-def _plane_components(labels: Tensor, nearest: Tensor) -> Tensor:
-    """Return the initial region of each point ``(n,)``: connected parts of planes, or the point."""
-    segments, regions = Segments(connected_points(labels, nearest)), torch.arange(len(labels))
-    regions[segments.rows] = segments.broadcast(segments.first(regions))
-    initial: Tensor = torch.unique(regions, return_inverse=True)[1]
-    return initial
-
-
 def _initial_regions(
     regions: Tensor,
     positions: Tensor,
@@ -389,15 +381,10 @@ def _contact_differences(
     there = [column[near] for column in columns]
     offset = [b - a for a, b in zip(here[:3], there[:3], strict=True)]
     ends = here[3:], there[3:]
-    step = torch.minimum(*(_dot(offset, normal).square() for normal in ends)) / _dot(offset, offset)
+    steps = (sum_products(offset, normal).square() for normal in ends)
+    step = torch.minimum(*steps) / sum_squares(offset)
     is_different = (labels[rows, None] != labels[near]).double()
     return sq_chords(*ends) + _STEP_WEIGHT * step + _PLANE_WEIGHT * is_different
-
-
-def _dot(a: Sequence[Tensor], b: Sequence[Tensor]) -> Tensor:
-    """Return the inner products of vectors in columns."""
-    (x, y, z), (u, v, w) = a, b
-    return x * u + y * v + z * w
 
 
 def _aggregate(a: Tensor, b: Tensor, contacts: Tensor | None, difference: Tensor) -> _Boundaries:

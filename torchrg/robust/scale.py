@@ -135,20 +135,13 @@ def _reduce_axis(
     name: Scale, x: Tensor, dim: int, mask: Tensor | None, finite_sample: bool = False
 ) -> Tensor:
     """Check the arguments of a scale, and reduce an axis."""
-    rows, counted = _rows_along(name, x, dim, mask)
-    return scale_of_rows(rows, counted, name=name, finite_sample=finite_sample)
-
-
-def _rows_along(
-    caller: str, x: Tensor, dim: int, mask: Tensor | None
-) -> tuple[Tensor, Tensor | None]:
-    """Check values and mask, and move the axis to the end."""
-    x = as_tensor(caller, "x", x)
-    check_floating(caller, x=x)
-    check_shapes(caller, x=(x, "*"), mask=(mask, "*"))
+    x = as_tensor(name, "x", x)
+    check_floating(name, x=x)
+    check_shapes(name, x=(x, "*"), mask=(mask, "*"))
     if not -x.dim() <= dim < x.dim():
-        raise ShapeError(f"{caller}: expected x with an axis {dim}, got shape {tuple(x.shape)}.")
-    return x.movedim(dim, -1), None if mask is None else mask.movedim(dim, -1)
+        raise ShapeError(f"{name}: expected x with an axis {dim}, got shape {tuple(x.shape)}.")
+    counted = None if mask is None else mask.movedim(dim, -1)
+    return scale_of_rows(x.movedim(dim, -1), counted, name=name, finite_sample=finite_sample)
 
 
 @opaque(lambda rows: rows.new_empty(rows.shape[:-1]))
