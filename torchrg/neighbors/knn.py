@@ -120,10 +120,11 @@ def search_knn(
                 lists += start
             continue
         _search_cloud(cloud, slice(0, len(cloud)), order, start, indices[start:stop])
-    columns = [indices]
+    valid: Tensor | None = None
     if max_distance is not None:
-        columns.append(_drop_far_neighbors(coordinates, indices, max_distance))
-    return Neighbors(*(torch.from_numpy(column).to(tensor.device) for column in columns))
+        is_near = _drop_far_neighbors(coordinates, indices, max_distance)
+        valid = torch.from_numpy(is_near).to(tensor.device)
+    return Neighbors(torch.from_numpy(indices).to(tensor.device), valid)
 
 
 def _drop_far_neighbors(

@@ -12,7 +12,7 @@ from torchrg._parallel import ROWS_IN_CACHE, limit_rows
 from torchrg.config import NormalsConfig
 from torchrg.neighbors import measure_sampling, search_knn
 from torchrg.normals.consensus import constants
-from torchrg.normals.consensus.noise import NoiseEstimate, estimate_noise, regional_noise
+from torchrg.normals.consensus.noise import estimate_noise, regional_noise
 from torchrg.normals.consensus.smoothing import (
     choose_planes,
     describe_inliers,
@@ -64,7 +64,9 @@ def estimate_consensus(
         return fit._replace(sharp=torch.zeros_like(fit.valid))
     survey = estimate_noise(points, neighbors, fit, chunk_size=size)
     if config.adaptive_k is not None:
-        count = adapted_count(_noise_fraction(survey), neighbors.indices.shape[1], config)
+        is_known = survey.noise.isfinite() & (survey.radius > 0)
+        fractions = torch.where(is_known, survey.noise / survey.radius, torch.nan)
+        count = adapted_count(fractions, neighbors.indices.shape[1], config)
         if count > neighbors.indices.shape[1]:
             neighbors = search_knn(points, count)
             fit = fit_points_pca(points, neighbors, chunk_size=chunk_size).map(scratch.store)
@@ -89,12 +91,6 @@ def estimate_consensus(
         points, neighbors, planes, noise, fit, sharp, chunk_size=size
     )
     return NormalFit(planes.normals, curvature, fit.valid, residual_rms, sharp)
-
-
-def _noise_fraction(survey: NoiseEstimate) -> Tensor:
-    """Return the ratio of noise to neighborhood radius, shape ``(N,)``; NaN if unknown."""
-    is_known = survey.noise.isfinite() & (survey.radius > 0)
-    return torch.where(is_known, survey.noise / survey.radius, torch.nan)
 
 
 def adapted_count(fractions: Tensor, count: int, config: NormalsConfig) -> int:

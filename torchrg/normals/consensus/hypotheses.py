@@ -1,8 +1,10 @@
 """Hypotheses at a broken point: the voted plane, two meeting planes, and three."""
 
 from collections.abc import Sequence
+from functools import cache
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,9 +21,23 @@ from torchrg.linalg.moments import (
 )
 from torchrg.linalg.precision import rounded_sqrt
 from torchrg.normals.consensus import constants
-from torchrg.normals.consensus.candidates import candidate_ranks
 
 _PLANE_PARAMETERS = 3
+
+
+@cache
+def candidate_ranks(num_neighbors: int) -> Tensor:
+    """Return the ranks ``(P, 2)`` of the neighbors that span candidates with the point.
+
+    They are spread over all neighbors, near ones more often.
+    """
+    last, num_pairs = num_neighbors - 1, constants.NUM_CANDIDATES
+    # The plastic number's low-discrepancy sequence covers the square of pairs evenly.
+    steps = np.arange(1, 8 * num_pairs)[:, None] * np.array([0.7548776662466927, 0.569840290998])
+    ranks = 1 + np.floor(last * (steps % 1.0) ** constants.CANDIDATE_POWER).astype(int)
+    pairs = dict.fromkeys((min(a, b), max(a, b)) for a, b in ranks.tolist() if a != b)
+    found = list(pairs)[:num_pairs] if last > 1 else []
+    return torch.tensor(found, dtype=torch.int64, device="cpu").view(-1, 2)
 
 
 def vote_planes(
@@ -55,11 +71,11 @@ def vote_planes(
         near = columns[0][chunk], columns[1][chunk], columns[2][chunk]
         normals[chunk] = _best_normals(near, weights[chunk], start[chunk], reach[chunk], ranks)
     for _ in range(constants.NUM_REFITS):
-        normals, offsets = _refit(*columns, weights, normals, offsets, reach)
+        normals, offsets = _refit(columns, weights, normals, offsets, reach)
     weights = (1 - constants.FIT_FALLOFF * nearness) * counted
     reach = constants.FIT_REACH * noise
     for _ in range(constants.NUM_REFITS):
-        normals, offsets = _refit(*columns, weights, normals, offsets, reach, bisquare=True)
+        normals, offsets = _refit(columns, weights, normals, offsets, reach, bisquare=True)
     return normals, offsets
 
 
@@ -85,16 +101,8 @@ def _best_normals(
     return candidates.gather(1, best[:, :, None].expand(-1, 1, 3)).squeeze(1)
 
 
-def _parabolic_weights(distances: Tensor, reach: Tensor) -> Tensor:
-    """Return ``max(0, 1 - (r / reach)^2)``."""
-    distances = distances / reach[:, None]
-    return (1 - distances * distances).clamp_(min=0)
-
-
 def _refit(
-    x: Tensor,
-    y: Tensor,
-    z: Tensor,
+    columns: Columns,
     weights: Tensor,
     normals: Tensor,
     offsets: Tensor,
@@ -103,10 +111,11 @@ def _refit(
     bisquare: bool = False,
 ) -> tuple[Tensor, Tensor]:
     """Return planes fitted to the points near planes; unchanged if these points span none."""
-    near = _parabolic_weights(residuals((x, y, z), normals, offsets), reach)
+    distances = residuals(columns, normals, offsets) / reach[:, None]
+    near = (1 - distances * distances).clamp_(min=0)
     if bisquare:
         near *= near
-    fitted, shifted, values = fit_weighted_planes((x, y, z), weights * near)
+    fitted, shifted, values = fit_weighted_planes(columns, weights * near)
     spread = values[:, 1] > 1e-6 * values[:, 2]  # More than rounding.
     return torch.where(spread[:, None], fitted, normals), torch.where(spread, shifted, offsets)
 
@@ -199,24 +208,13 @@ def fit_wedges(columns: Columns, normals: Tensor, offsets: Tensor, noise: Tensor
     second, first = _off_surface(distances, noise), _near(distances, noise)
     present = torch.ones_like(noise, dtype=torch.bool)
     for _ in range(constants.NUM_ALTERNATIONS):
-        first, second, outer, present, *planes = _wedge(*columns, first, second, present)
-    pairs = list(zip(planes[::2], planes[1::2], strict=True))
-    return Wedge(_summary(pairs, (first, second), outer, present), first, outer)
-
-
-def _wedge(
-    x: Tensor, y: Tensor, z: Tensor, first: Tensor, second: Tensor, present: Tensor
-) -> tuple[Tensor, ...]:
-    """Return updated points of two meeting planes, their distances, and the planes."""
-    columns = x, y, z
-    present = present & _all_present((first, second))
-    planes = fit_planes_to_each(columns, (first, second))
-    inside = (
-        _inside(residuals(columns, *planes[0]), second),
-        _inside(residuals(columns, *planes[1]), first),
-    )
-    first = above(inside[1], inside[0])
-    return first, 1 - first, torch.minimum(*inside), present, *planes[0], *planes[1]
+        present = present & _all_present((first, second))
+        planes = fit_planes_to_each(columns, (first, second))
+        one, other = (residuals(columns, *plane) for plane in planes)
+        inside = _inside(one, second), _inside(other, first)
+        first = above(inside[1], inside[0])
+        second, outer = 1 - first, torch.minimum(*inside)
+    return Wedge(_summary(planes, (first, second), outer, present), first, outer)
 
 
 def fit_corners(columns: Columns, groups: Sequence[Tensor]) -> MeetingPlanes:
@@ -229,42 +227,21 @@ def fit_corners(columns: Columns, groups: Sequence[Tensor]) -> MeetingPlanes:
     """
     first, second, third = groups
     present = torch.ones_like(first[:, 0], dtype=torch.bool)
+    # 1 if the third plane cuts the wedge, -1 if it is added, 0 if undetermined.
     side = torch.zeros_like(columns[0][:, 0])
     for _ in range(constants.NUM_ALTERNATIONS):
-        first, second, third, outer, present, side, *planes = _corner(
-            *columns, first, second, third, present, side
-        )
-    pairs = list(zip(planes[::2], planes[1::2], strict=True))
-    return _summary(pairs, (first, second, third), outer, present)
-
-
-def _corner(
-    x: Tensor,
-    y: Tensor,
-    z: Tensor,
-    first: Tensor,
-    second: Tensor,
-    third: Tensor,
-    present: Tensor,
-    side: Tensor,
-) -> tuple[Tensor, ...]:
-    """Return updated points of three planes, their distances, the side, and the planes.
-
-    ``side`` is 1 if the third plane cuts the wedge, -1 if it is added, 0 if undetermined.
-    """
-    columns = x, y, z
-    present = present & _all_present((first, second, third))
-    planes = fit_planes_to_each(columns, (first, second, third))
-    distances = [residuals(columns, *plane) for plane in planes]
-    inside = _inside(distances[0], second), _inside(distances[1], first)
-    wedge, added = torch.minimum(*inside), _inside(distances[2], first + second)
-    side = torch.where(side == 0, _side(sum_neighbors(wedge * third)).squeeze(1), side)
-    wedge *= side[:, None]
-    outer = torch.minimum(added, wedge) * side[:, None]
-    third = above(wedge, added)
-    first = above(inside[1], inside[0]).mul_(1 - third)
-    fitted = (values for plane in planes for values in plane)
-    return first, 1 - third - first, third, outer, present, side, *fitted
+        present = present & _all_present((first, second, third))
+        planes = fit_planes_to_each(columns, (first, second, third))
+        distances = [residuals(columns, *plane) for plane in planes]
+        inside = _inside(distances[0], second), _inside(distances[1], first)
+        wedge, added = torch.minimum(*inside), _inside(distances[2], first + second)
+        side = torch.where(side == 0, _side(sum_neighbors(wedge * third)).squeeze(1), side)
+        wedge *= side[:, None]
+        outer = torch.minimum(added, wedge) * side[:, None]
+        third = above(wedge, added)
+        first = above(inside[1], inside[0]).mul_(1 - third)
+        second = 1 - third - first
+    return _summary(planes, (first, second, third), outer, present)
 
 
 def split_off(first: Tensor, outer: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:

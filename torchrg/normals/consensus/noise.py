@@ -10,6 +10,7 @@ from torchrg import kernels, scratch
 from torchrg._parallel import CHUNK_SIZE, ROWS_IN_CACHE, limit_rows, map_chunks, nonzero_rows
 from torchrg.linalg.angles import above
 from torchrg.linalg.moments import (
+    Columns,
     dot,
     fit_parallel_planes,
     fit_weighted_planes,
@@ -156,10 +157,7 @@ def _deviations(
     """Return survey parts, a mask of layered residuals, and a mask of duplicate positions."""
     columns = gather_columns(points, indices)
     counted = torch.ones_like(columns[0]) if mask is None else mask.to(columns[0].dtype)
-    count = counted.sum(dim=1)
-    center = [sum_neighbors(column * counted) / count.clamp(min=1) for column in columns]
-    offsets = dot(normals, torch.stack(center, dim=-1))
-    distances = residuals(columns, normals, offsets)
+    count, offsets, distances = _center_planes(columns, counted, normals)
     squares = distances * distances * counted
     second, fourth = sum_neighbors(squares), sum_neighbors(squares.square())
     deviations = rounded_sqrt(second / (count - 3).clamp(min=1))
@@ -171,14 +169,20 @@ def _deviations(
     return offsets, radius, single, low & single.isfinite(), (moves == 0).any(dim=1)
 
 
+def _center_planes(columns: Columns, counted: Tensor, normals: Tensor) -> tuple[Tensor, ...]:
+    """Return neighbor counts, offsets of planes through the mean neighbor, and residuals."""
+    count = counted.sum(dim=1)
+    center = [sum_neighbors(column * counted) / count.clamp(min=1) for column in columns]
+    offsets = dot(normals, torch.stack(center, dim=-1))
+    return count, offsets, residuals(columns, normals, offsets)
+
+
 def _layered_deviations(points: Tensor, near: Neighbors, normals: Tensor, single: Tensor) -> Tensor:
     """Return deviations from two parallel planes, the faces of a plate; inf if there are none."""
     columns = gather_columns(points, near.indices)
     counted = near.mask().to(points.dtype)
-    count = counted.sum(dim=1)
-    center = [sum_neighbors(column * counted) / count.clamp(min=1) for column in columns]
-    offsets = dot(normals, torch.stack(center, dim=-1))
-    upper = above(residuals(columns, normals, offsets), 0) * counted
+    count, _, distances = _center_planes(columns, counted, normals)
+    upper = above(distances, 0) * counted
     for _ in range(constants.NUM_REFITS):
         normals, two, squares = fit_parallel_planes(columns, (upper, counted - upper))
         upper = above(project(columns, normals), two.mean(dim=0)[:, None]) * counted
@@ -233,11 +237,6 @@ def _neighbor_quantiles(values: Tensor, neighbors: Neighbors, quantile: float) -
             return
         for column, out in zip(values.unbind(dim=1), quantiles[block].unbind(dim=1), strict=True):
             near_values = near.gather(column)
-            if near.valid is None and values.device.type == "cpu":
-                # Ten times faster than torch.
-                near_values.numpy().partition(rank - 1, axis=1)
-                out[:] = near_values[:, rank - 1]
-                continue
             if near.valid is None:
                 out[:] = near_values.kthvalue(rank, dim=1).values
                 continue

@@ -10,13 +10,30 @@ from torchrg._parallel import ROWS_AT_ONCE, map_chunks, map_selected, nonzero_ro
 from torchrg.linalg.moments import Columns, unbind_columns
 from torchrg.neighbors.knn import gather_columns, gather_patches
 from torchrg.normals.consensus import constants
-from torchrg.normals.consensus.candidates import candidate_ranks
-from torchrg.normals.consensus.hypotheses import MeetingPlanes, fit_meeting_planes, vote_planes
+from torchrg.normals.consensus.hypotheses import (
+    MeetingPlanes,
+    candidate_ranks,
+    fit_meeting_planes,
+    vote_planes,
+)
 from torchrg.normals.consensus.noise import NoiseEstimate
 from torchrg.normals.jet import FLAT_PIVOT, fit_paraboloids
 from torchrg.structures import Neighbors, NormalFit
 
 _PARABOLOID_PARAMETERS = 6
+_KERNEL_PARAMETERS = (
+    constants.VOTE_REACH,
+    constants.VOTE_FALLOFF,
+    constants.FIT_REACH,
+    constants.FIT_FALLOFF,
+    constants.MEETING_GAP,
+    constants.CORNER_LIMIT,
+    constants.CORNER_FRACTION,
+    constants.NUM_REFITS,
+    constants.NUM_ALTERNATIONS,
+    constants.MIN_PLANE_POINTS,
+)
+"""Constants of the kernel of :func:`broken_planes`, in its order."""
 
 
 class TangentPlanes(NamedTuple):
@@ -51,7 +68,12 @@ def fit_surfaces(
     deviations = survey.deviations.clone()
 
     def fit_curved(rows: Tensor) -> None:
-        fitted = _paraboloids(points, *neighbors, fit.normals, rows)
+        cloud = points, *neighbors, fit.normals
+        if kernels.serve(*cloud, k=neighbors.indices.shape[1]):
+            fitted = kernels.call("fit_paraboloids", *cloud, rows, FLAT_PIVOT)
+        else:
+            near, counted = neighbors.indices[rows], neighbors.mask(rows).to(points.dtype)
+            fitted = fit_paraboloids(gather_columns(points, near), fit.normals[rows], counted)
         normals[rows], offsets[rows], deviations[rows] = fitted
 
     not_flat = fit.valid & (survey.deviations > constants.FLAT_LIMIT * noise)
@@ -105,43 +127,13 @@ def broken_planes(
     """
     if kernels.serve(points, *near, noise, normals, k=near.indices.shape[1]) and len(noise):
         count = near.indices.shape[1] if near.valid is None else int(near.valid[0].sum())
-        fits = kernels.call(
-            "broken_planes", points, *near, noise, normals, candidate_ranks(count), _kernel_args()
-        )
+        parameters = torch.tensor(_KERNEL_PARAMETERS, dtype=torch.float32)
+        cloud = points, *near, noise, normals
+        fits = kernels.call("broken_planes", *cloud, candidate_ranks(count), parameters)
         return TangentPlanes(*fits[:2]), MeetingPlanes(*fits[2:])
     columns = _gather_counted(points, near)
     voted = vote_planes(columns, noise, normals, torch.ones_like(columns[0]))
     return TangentPlanes(*voted), fit_meeting_planes(columns, *voted, noise)
-
-
-def _kernel_args() -> Tensor:
-    """Return the constants for the kernel of :func:`broken_planes`, in its order."""
-    return torch.tensor(
-        [
-            constants.VOTE_REACH,
-            constants.VOTE_FALLOFF,
-            constants.FIT_REACH,
-            constants.FIT_FALLOFF,
-            constants.MEETING_GAP,
-            constants.CORNER_LIMIT,
-            constants.CORNER_FRACTION,
-            constants.NUM_REFITS,
-            constants.NUM_ALTERNATIONS,
-            constants.MIN_PLANE_POINTS,
-        ],
-        dtype=torch.float32,
-    )
-
-
-def _paraboloids(
-    points: Tensor, indices: Tensor, valid: Tensor | None, normals: Tensor, rows: Tensor
-) -> tuple[Tensor, ...]:
-    """Apply :func:`torchrg.normals.jet.fit_paraboloids` to the given points."""
-    arguments = points, indices, valid, normals
-    if kernels.serve(*arguments, k=indices.shape[1]):
-        return kernels.call("fit_paraboloids", *arguments, rows, FLAT_PIVOT)
-    counted = Neighbors(indices, valid).mask(rows).to(points.dtype)
-    return fit_paraboloids(gather_columns(points, indices[rows]), normals[rows], counted)
 
 
 def _group_by_count(chosen: Tensor, neighbors: Neighbors) -> list[Tensor]:
