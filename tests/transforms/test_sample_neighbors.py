@@ -24,13 +24,13 @@ from torchrg.transforms import (
 def searches(monkeypatch):
     """Numbers of neighbors that are searched, one for each search of a cloud."""
     asked = []
-    search = knn._search_cloud
+    search = knn.search_rows
 
-    def counted(points, rows, order, start, indices):
+    def counted(points, rows, order, indices, start=0):
         asked.append(indices.shape[1])
-        search(points, rows, order, start, indices)
+        search(points, rows, order, indices, start)
 
-    monkeypatch.setattr(knn, "_search_cloud", counted)
+    monkeypatch.setattr(knn, "search_rows", counted)
     return asked
 
 

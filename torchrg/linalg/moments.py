@@ -21,11 +21,6 @@ from torchrg.linalg.eigen import smallest_eigenvector3
 
 _MIN_POINTS = 2**14
 """Minimum number of points per thread."""
-_COORDINATE_KERNELS = {
-    torch.float32: "segment_coordinates",
-    torch.float64: "segment_coordinates_double",
-}
-"""Kernels for the coordinates of vectors, by dtype."""
 _SORTED_SIZE = 50
 """Mean number of points per region below which one sort of all values is faster than a selection
 per region."""
@@ -191,17 +186,18 @@ class Segments:
 
         ``vectors`` are ``(N, 3)``, ``axes`` ``(M, A, 3)``; returns A columns ``(n,)``, float64.
         """
-        if self.are_served(centers) and vectors.dtype in _COORDINATE_KERNELS:
-            name, tables = _COORDINATE_KERNELS[vectors.dtype], (self.rows, self.counts)
-            return list(kernels.call(name, *vectors.unbind(dim=1), *tables, centers, axes)[0])
-        about, columns = self.gather_centered(vectors, centers), []
+        if self.are_served(centers) and vectors.dtype in (torch.float32, torch.float64):
+            name = "segment_coordinates" + "_double" * (vectors.dtype == torch.float64)
+            columns = *vectors.unbind(dim=1), self.rows, self.counts, centers, axes
+            return list(kernels.call(name, *columns)[0])
+        about, found = self.gather_centered(vectors, centers), []
         for axis in axes.unbind(dim=1):
             total = torch.zeros_like(about[0])
             # Separate products and sums: their rounding must not depend on block boundaries.
             for column, component in zip(about, axis.unbind(dim=1), strict=True):
                 total += column * self.broadcast(component)
-            columns.append(total)
-        return columns
+            found.append(total)
+        return found
 
     def gather_centered(self, vectors: Tensor, centers: Tensor) -> list[Tensor]:
         """Apply :meth:`gather` to vectors ``(N, 3)``, relative to region centers ``(M, 3)``."""

@@ -76,7 +76,8 @@ def near_boxes(
     for chunk in split_rows(len(chosen), _BOXES_AT_ONCE):
         low, high = boxes.low[chosen[chunk]], boxes.high[chosen[chunk]]
         near = _near_bounding_box(all_low, all_high, low, high, reach[chunk])
-        within = _gaps(all_low[near], all_high[near], low, high) <= reach[chunk, None] * _ROUNDING
+        gap = np.maximum(all_low[near] - high[:, None], low[:, None] - all_high[near]).clip(min=0)
+        within = np.sqrt((gap * gap).sum(axis=2)) <= reach[chunk, None] * _ROUNDING
         is_near[nearby[near[within.any(axis=0)]]] = True
     return is_near
 
@@ -102,18 +103,6 @@ def farthest_neighbor(boxes: Boxes, box: int, k: int) -> float:
     order = np.argsort(distances)
     enough = np.searchsorted(np.cumsum(np.diff(boxes.starts)[order]), k)
     return float(distances[order[enough]])
-
-
-def _gaps(
-    low: NDArray[np.float64],
-    high: NDArray[np.float64],
-    query_low: NDArray[np.float64],
-    query_high: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Return the distances between query boxes and boxes, shape ``(queries, boxes)``."""
-    gap = np.maximum(low - query_high[:, None], query_low[:, None] - high).clip(min=0)
-    distance: NDArray[np.float64] = np.sqrt((gap * gap).sum(axis=2))
-    return distance
 
 
 def search_blocks(

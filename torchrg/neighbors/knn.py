@@ -119,7 +119,7 @@ def search_knn(
             if start:
                 lists += start
             continue
-        _search_cloud(cloud, slice(0, len(cloud)), order, start, indices[start:stop])
+        search_rows(cloud, slice(0, len(cloud)), order, indices[start:stop], start)
     valid: Tensor | None = None
     if max_distance is not None:
         is_near = _drop_far_neighbors(coordinates, indices, max_distance)
@@ -279,28 +279,16 @@ def prepare_search(points: NDArray[np.floating], k: int) -> SomeNeighbors:
 @sequential_operations()
 def search_rows(
     points: NDArray[np.floating],
-    rows: slice,
-    numbers: NDArray[np.int64],
+    query_rows: slice,
+    order: NDArray[np.int64] | None,
     indices: NDArray[np.int32],
+    first_row: int = 0,
 ) -> None:
     """Write the neighbors of some rows of points in canonical order to lists ``(N, k)``.
 
-    ``numbers`` ``(n,)`` are the rows of the points in the lists.
-    """
-    _search_cloud(points, rows, numbers, 0, indices)
-
-
-def _search_cloud(
-    points: NDArray[np.floating],
-    query_rows: slice,
-    order: NDArray[np.int64] | None,
-    first_row: int,
-    indices: NDArray[np.int32],
-) -> None:
-    """Search one cloud in canonical order and write results in the caller's order.
-
-    Rows outside ``query_rows`` may be searched or not. The tree holds each distinct position once,
-    so that duplicates cost nothing.
+    ``order`` ``(n,)`` are the rows of the points in the lists, default their own; ``first_row`` is
+    added to each neighbor. Rows outside ``query_rows`` may be searched or not. The tree holds each
+    distinct position once, so that duplicates cost nothing.
     """
     from scipy.spatial import cKDTree
 

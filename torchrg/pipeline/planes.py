@@ -174,10 +174,18 @@ def _segment(
     begin("neighbors")
     distinct = DistinctPoints(*map(scratch.store, distinct_points(points)))
     sites = _find_sites(distinct, voxel)
-    if voxel is not None or min(len(sites.points), config.normals.k) > 2:
-        _warn_about_size(len(sites.points), config.normals.k)
-    neighbors = search_distinct(sites.points, config.normals.k)
-    sampling = measure_sampling(sites.points, neighbors) if _has_auto(config) else None
+    num_sites, k = len(sites.points), config.normals.k
+    if num_sites < _MIN_NEIGHBORHOODS * k and (voxel is not None or min(num_sites, k) > 2):
+        warn(
+            f"segment_planes: expected at least {_MIN_NEIGHBORHOODS * k:,} distinct points for "
+            f"neighborhoods of {k:,}, got {num_sites:,}; add points, or reduce normals.k or the "
+            "voxel size.",
+            CloudWarning,
+        )
+    neighbors, sampling = search_distinct(sites.points, k), None
+    is_auto = config.normals.method == "consensus" and config.normals.noise_scope == "auto"
+    if is_auto or needs_sampling(config.growing):
+        sampling = measure_sampling(sites.points, neighbors)
     config = config if sampling is None else config.with_sampling(sampling)
 
     begin("normals")
@@ -332,17 +340,6 @@ def _complete(
     return planes
 
 
-def _warn_about_size(num_points: int, k: int) -> None:
-    """Warn if every neighborhood contains more than half of a cloud."""
-    if num_points < _MIN_NEIGHBORHOODS * k:
-        warn(
-            f"segment_planes: expected at least {_MIN_NEIGHBORHOODS * k:,} distinct points for "
-            f"neighborhoods of {k:,}, got {num_points:,}; add points, or reduce normals.k or the "
-            "voxel size.",
-            CloudWarning,
-        )
-
-
 def _number_parts(inverse: Tensor, objects: Tensor, num_sites: int) -> tuple[Rows, Tensor, Tensor]:
     """Return the sites and objects of parts in ascending order, and the part of each point.
 
@@ -358,9 +355,3 @@ def _number_parts(inverse: Tensor, objects: Tensor, num_sites: int) -> tuple[Row
     num_bad = int(torch.count_nonzero(keys < 0))
     keys, part = keys[num_bad:], (part - num_bad).clamp(min=UNLABELED)
     return keys // len(values), keys % len(values), part
-
-
-def _has_auto(config: PipelineConfig) -> bool:
-    """Return whether a setting in use is measured from the cloud (``auto``)."""
-    scope = config.normals.method == "consensus" and config.normals.noise_scope
-    return scope == "auto" or needs_sampling(config.growing)

@@ -136,8 +136,7 @@ class KnnAdjacency:
 
     def boundary(self, labels: Tensor) -> Tensor:
         """Return the points with a nearest neighbor in another region, also unlabeled points."""
-        no_table = labels.new_empty((0, 0), dtype=torch.int64)
-        return nonzero_rows(_mark_boundary(labels.to(torch.int32), self._all, _NEAREST, no_table))
+        return nonzero_rows(_mark_boundary(labels.to(torch.int32), self._all, _NEAREST))
 
 
 def find_region_pairs(
@@ -172,17 +171,11 @@ class _RegionEdges:
         self._labels, self._neighbors, self._columns = labels.to(torch.int32), neighbors, columns
         self._num_regions = max(int(labels.max()) + 1, 1) if len(labels) else 1
         self._at_once = limit_rows(ROWS_IN_CACHE, neighbors.indices.shape[1])
-        # More possible pairs than points are too many for a table.
-        size = self._num_regions if self._num_regions**2 <= len(labels) else 0
-        table = labels.new_zeros((size, size), dtype=torch.int64)
-        meets = _mark_boundary(self._labels, neighbors, columns, table)
+        meets = _mark_boundary(self._labels, neighbors, columns)
         self._rows = nonzero_rows(meets & (self._labels >= 0)).to(torch.int32)
-        self._keys = nonzero_rows(table)
-        self.counts = table.flatten()[self._keys]
-        if len(self._rows) and not len(self._keys):
-            chunks = torch.split(self._rows, self._at_once)
-            keys = torch.cat([self._find(rows)[3].clone() for rows in chunks])
-            self._keys, self.counts = torch.unique(keys, return_counts=True)
+        chunks = torch.split(self._rows, self._at_once)
+        keys = torch.cat([self._find(rows)[3].clone() for rows in chunks])
+        self._keys, self.counts = torch.unique(keys, return_counts=True)
         first, second = self._keys // self._num_regions, self._keys % self._num_regions
         self.pairs = torch.stack([first, second], dim=1)
 
@@ -222,18 +215,16 @@ def _are_served(labels: Tensor, neighbors: Neighbors) -> bool:
     return kernels.serve(labels, *present) and all(part.is_contiguous() for part in present)
 
 
-def _mark_boundary(labels: Tensor, neighbors: Neighbors, columns: slice, table: Tensor) -> Tensor:
-    """Return which points have a neighbor in another region, ``(N,)``; labels are int32.
-
-    Kernels also count the edges of each pair of regions in a ``table`` ``(R, R)``, if not empty.
-    """
+def _mark_boundary(labels: Tensor, neighbors: Neighbors, columns: slice) -> Tensor:
+    """Return which points have a neighbor in another region, ``(N,)``; labels are int32."""
     meets = torch.empty_like(labels, dtype=torch.bool)
+    no_table = labels.new_empty((0, 0), dtype=torch.int64)
 
     def mark(chunk: slice) -> None:
         if _are_served(labels, neighbors):
             low, high, _ = columns.indices(neighbors.indices.shape[1])
             where = chunk.start, chunk.stop, low, high
-            kernels.call("mark_boundary", labels, *neighbors, *where, table, meets)
+            kernels.call("mark_boundary", labels, *neighbors, *where, no_table, meets)
         else:
             near = neighbors.select(chunk)
             meets[chunk] = _crosses(labels, chunk, near, columns).any(dim=1)

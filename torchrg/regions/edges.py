@@ -115,7 +115,10 @@ def _become_seeds(
     target = cloud.neighbors.gather(cloud.curvature, rows)
     if config.curvature_scope == "neighborhood":
         counted = cloud.neighbors.mask(rows) & cloud.neighbors.gather(cloud.valid, rows)
-        limit = _curvature_limits(target, counted, config.curvature_quantile)
+        ascending = target.where(counted, torch.inf).sort(dim=1).values
+        last = (counted.sum(dim=1, keepdim=True) - 1).double()
+        index = (config.curvature_quantile * last).long().clamp_min(0)
+        limit = ascending.gather(1, index)
     if config.seed_rule == "increment":
         becomes_seed = (target - cloud.curvature[rows, None]).abs() <= limit
     else:
@@ -123,13 +126,6 @@ def _become_seeds(
     if connected is not None and config.connectivity_scope == "seed":
         becomes_seed &= connected
     return becomes_seed
-
-
-def _curvature_limits(curvature: Tensor, counted: Tensor, quantile: float) -> Tensor:
-    """Return the lower quantile of the counted values of each row ``(n, K)``, shape ``(n, 1)``."""
-    ascending = curvature.where(counted, torch.inf).sort(dim=1).values
-    index = (quantile * (counted.sum(dim=1, keepdim=True) - 1).double()).long()
-    return ascending.gather(1, index.clamp_min(0))
 
 
 def accept_edges(

@@ -15,7 +15,7 @@ from torchrg._checks import as_tensor, check_floating, check_shapes, eager_only
 from torchrg._parallel import CHUNK_SIZE, limit_rows
 from torchrg.config import AnyConfig, GrowingConfig, settings_of
 from torchrg.errors import ConfigError, ShapeError
-from torchrg.linalg.moments import to_column_major
+from torchrg.linalg.moments import kth_smallest, to_column_major
 from torchrg.linalg.precision import is_single, to_single
 from torchrg.neighbors import canonical_order, measure_sampling
 from torchrg.neighbors.knn import check_neighbors
@@ -281,7 +281,7 @@ def grow(cloud: GrowingInput, config: GrowingConfig, chunk_size: int) -> Tensor:
     Invalid points, and some points of regions below ``min_size``, have no root.
     """
     growing, indices = cloud.curvature[cloud.valid], cloud.neighbors.indices.cpu()
-    limit = curvature_limit(growing, config.curvature_quantile)
+    limit = kth_smallest(growing, int(config.curvature_quantile * (len(growing) - 1)))
     is_seed, valid = (cloud.curvature <= limit).cpu(), cloud.valid.cpu()
     order = ascending_rows(cloud.curvature.cpu())
     order = order[valid[order]].int()
@@ -299,13 +299,6 @@ def grow(cloud: GrowingInput, config: GrowingConfig, chunk_size: int) -> Tensor:
     else:
         roots = grow_fifo(*tables, order, late=late)
     return roots.to(cloud.points.device)
-
-
-def curvature_limit(curvature: Tensor, quantile: float) -> Tensor:
-    """Return the lower quantile of curvatures ``(n,)``, which is one of them; 0 if n is 0."""
-    if len(curvature) == 0:
-        return curvature.new_zeros(())
-    return curvature.kthvalue(int(quantile * (len(curvature) - 1)) + 1).values
 
 
 def grow_fifo(

@@ -1,7 +1,6 @@
 """Hypotheses at a broken point: the voted plane, two meeting planes, and three."""
 
 from collections.abc import Sequence
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -25,7 +24,6 @@ from torchrg.normals.consensus import constants
 _PLANE_PARAMETERS = 3
 
 
-@cache
 def candidate_ranks(num_neighbors: int) -> Tensor:
     """Return the ranks ``(P, 2)`` of the neighbors that span candidates with the point.
 
@@ -176,21 +174,17 @@ def fit_meeting_planes(
         split_off(wedge.first[rows], wedge.outer[rows], noise[rows]),
         split_by_votes(corners, normals[rows], offsets[rows], noise[rows]),
     ):
-        best = _select_better(best, fit_corners(corners, groups))
+        found = fit_corners(corners, groups)
+        less = found.deviations < best.deviations
+        best = MeetingPlanes(
+            torch.where(less[:, None], found.normals, best.normals),
+            torch.where(less, found.offsets, best.offsets),
+            torch.where(less, found.deviations, best.deviations),
+        )
     improved = best.deviations < limit
     rows = rows[improved]
     merged = [old.index_copy(0, rows, new[improved]) for old, new in zip(two, best, strict=True)]
     return MeetingPlanes(*merged)
-
-
-def _select_better(one: MeetingPlanes, other: MeetingPlanes) -> MeetingPlanes:
-    """Return the fit with the smaller deviation for each point."""
-    less = other.deviations < one.deviations
-    return MeetingPlanes(
-        torch.where(less[:, None], other.normals, one.normals),
-        torch.where(less, other.offsets, one.offsets),
-        torch.where(less, other.deviations, one.deviations),
-    )
 
 
 def fit_wedges(columns: Columns, normals: Tensor, offsets: Tensor, noise: Tensor) -> Wedge:

@@ -143,20 +143,8 @@ def _measure_neighborhoods(
             constants.NUM_REFITS,
             constants.MIN_PLANE_POINTS,
         )
-    offsets, radius, single, looks_layered, repeats = _deviations(points, *near, normals, valid)
-    layered = torch.full_like(single, torch.inf)
-    if len(rows := nonzero_rows(looks_layered)):
-        layered[rows] = _layered_deviations(points, near.select(rows), normals[rows], single[rows])
-    nearest = [_nearest_deviations(points, near, count) for count in counts]
-    return offsets, radius, single, layered, repeats, *nearest
-
-
-def _deviations(
-    points: Tensor, indices: Tensor, mask: Tensor | None, normals: Tensor, valid: Tensor
-) -> tuple[Tensor, ...]:
-    """Return survey parts, a mask of layered residuals, and a mask of duplicate positions."""
-    columns = gather_columns(points, indices)
-    counted = torch.ones_like(columns[0]) if mask is None else mask.to(columns[0].dtype)
+    columns = gather_columns(points, near.indices)
+    counted = near.mask().to(points.dtype)
     count, offsets, distances = _center_planes(columns, counted, normals)
     squares = distances * distances * counted
     second, fourth = sum_neighbors(squares), sum_neighbors(squares.square())
@@ -164,9 +152,13 @@ def _deviations(
     single = torch.where(valid & (count > 3), deviations, torch.inf)
     radius = rounded_sqrt((sq_lengths(columns) * counted).amax(dim=1))
     low = fourth * count < constants.MAX_LAYERED_KURTOSIS * second * second
-    moves = sum((column[:, 1:] - column[:, :-1]).abs_() for column in columns)
-    assert isinstance(moves, Tensor)  # noqa: S101
-    return offsets, radius, single, low & single.isfinite(), (moves == 0).any(dim=1)
+    layered = torch.full_like(single, torch.inf)
+    if len(rows := nonzero_rows(low & single.isfinite())):
+        layered[rows] = _layered_deviations(points, near.select(rows), normals[rows], single[rows])
+    patches = torch.stack(columns, dim=-1)
+    repeats = (patches[:, 1:] == patches[:, :-1]).all(dim=-1).any(dim=1)
+    small = [_small_deviations(patches, counted, size) for size in counts]
+    return offsets, radius, single, layered, repeats, *small
 
 
 def _center_planes(columns: Columns, counted: Tensor, normals: Tensor) -> tuple[Tensor, ...]:
@@ -201,12 +193,6 @@ def _move_duplicates(points: Tensor, near: Neighbors) -> tuple[Tensor, Tensor]:
     order = repeats.to(torch.uint8).argsort(dim=1, stable=True)
     once = (counted & ~repeats).gather(1, order).to(points.dtype)
     return patches.gather(1, order[:, :, None].expand(-1, -1, 3)), once
-
-
-def _nearest_deviations(points: Tensor, near: Neighbors, count: int) -> Tensor:
-    """Return deviations of the ``count`` nearest points from their plane."""
-    patches = gather_patches(points, near.indices[:, :count])
-    return _small_deviations(patches, near.mask()[:, :count].to(points.dtype), count)
 
 
 def _small_deviations(patches: Tensor, counted: Tensor, count: int) -> Tensor:

@@ -21,19 +21,6 @@ from torchrg.normals.jet import FLAT_PIVOT, fit_paraboloids
 from torchrg.structures import Neighbors, NormalFit
 
 _PARABOLOID_PARAMETERS = 6
-_KERNEL_PARAMETERS = (
-    constants.VOTE_REACH,
-    constants.VOTE_FALLOFF,
-    constants.FIT_REACH,
-    constants.FIT_FALLOFF,
-    constants.MEETING_GAP,
-    constants.CORNER_LIMIT,
-    constants.CORNER_FRACTION,
-    constants.NUM_REFITS,
-    constants.NUM_ALTERNATIONS,
-    constants.MIN_PLANE_POINTS,
-)
-"""Constants of the kernel of :func:`broken_planes`, in its order."""
 
 
 class TangentPlanes(NamedTuple):
@@ -127,9 +114,20 @@ def broken_planes(
     """
     if kernels.serve(points, *near, noise, normals, k=near.indices.shape[1]) and len(noise):
         count = near.indices.shape[1] if near.valid is None else int(near.valid[0].sum())
-        parameters = torch.tensor(_KERNEL_PARAMETERS, dtype=torch.float32)
-        cloud = points, *near, noise, normals
-        fits = kernels.call("broken_planes", *cloud, candidate_ranks(count), parameters)
+        parameters = (
+            constants.VOTE_REACH,
+            constants.VOTE_FALLOFF,
+            constants.FIT_REACH,
+            constants.FIT_FALLOFF,
+            constants.MEETING_GAP,
+            constants.CORNER_LIMIT,
+            constants.CORNER_FRACTION,
+            constants.NUM_REFITS,
+            constants.NUM_ALTERNATIONS,
+            constants.MIN_PLANE_POINTS,
+        )
+        tables = candidate_ranks(count), torch.tensor(parameters, dtype=torch.float32)
+        fits = kernels.call("broken_planes", points, *near, noise, normals, *tables)
         return TangentPlanes(*fits[:2]), MeetingPlanes(*fits[2:])
     columns = _gather_counted(points, near)
     voted = vote_planes(columns, noise, normals, torch.ones_like(columns[0]))
