@@ -318,46 +318,38 @@ def grow_fifo(
     :func:`mark_edges` returns ``joins`` and ``makes_seed``. With ``late`` promotion, any edge of
     the region may promote a point; all other points are claimed after all seeds are known.
 
-    All queued seeds are processed at once with their edges in queue order. This claims the same
-    points as processing them one by one. Returns the root of each point's region.
+    Returns the root of each point's region.
     """
     lists, free, is_seed_itself = neighbors.numpy(), valid.numpy().copy(), is_seed.numpy()
-    roots, slots = np.full(len(free), UNLABELED, dtype=np.int32), np.empty(len(free), np.int32)
+    roots = np.full(len(free), UNLABELED, dtype=np.int32)
 
-    def claim(
-        root: np.integer, seeds: NDArray[np.integer], *, promoted: bool
-    ) -> NDArray[np.integer]:
-        """Assign unassigned neighbors of the seeds to a region, and return the new seeds."""
-        near = lists[seeds]
-        claims = _unpack(joins, seeds, near) & free[near]
-        by_edge = None if makes_seed is None else _unpack(makes_seed, seeds, near)
+    def claim(root: np.integer, seed: np.integer, *, promoted: bool) -> NDArray[np.integer]:
+        """Assign unassigned neighbors of a seed to a region, and return the new seeds."""
+        near = lists[seed]
+        claims = _unpack(joins, seed, len(near)) & free[near]
+        by_edge = None if makes_seed is None else _unpack(makes_seed, seed, len(near))
         if promoted:
             claims &= by_edge
         targets = near[claims]
-        # The last of several writes wins: in reverse order, the first edge to a point.
-        numbers = np.arange(len(targets), dtype=np.int32)
-        slots[targets[::-1]] = numbers[::-1]
         free[targets], roots[targets] = False, root
-        becomes_seed = is_seed_itself[targets] if by_edge is None else by_edge[claims]
-        new: NDArray[np.integer] = targets[becomes_seed & (slots[targets] == numbers)]
+        new: NDArray[np.integer] = targets[
+            is_seed_itself[targets] if by_edge is None else by_edge[claims]
+        ]
         return new
 
     for root in order.numpy():
         if not free[root]:
             continue
         free[root], roots[root] = False, root
-        waves: list[NDArray[np.integer]] = [np.array([root])]
-        while len(waves[-1]):
-            waves.append(claim(root, waves[-1], promoted=late))
-        for seeds in waves if late else ():
-            claim(root, seeds, promoted=False)
+        queue = [root]
+        for seed in queue:
+            queue.extend(claim(root, seed, promoted=late))
+        for seed in queue if late else ():
+            claim(root, seed, promoted=False)
     return torch.from_numpy(roots)
 
 
-def _unpack(
-    bits: Tensor, rows: NDArray[np.integer], near: NDArray[np.integer]
-) -> NDArray[np.bool_]:
-    """Return the bits of the given rows, one for each neighbor, shape ``(n, K)``."""
-    of_rows = bits.numpy()[rows].view(np.uint8)
-    flags = np.unpackbits(of_rows, axis=1, count=near.shape[1], bitorder="little")
+def _unpack(bits: Tensor, row: np.integer, count: int) -> NDArray[np.bool_]:
+    """Return the bits of a row, one for each of ``count`` neighbors."""
+    flags = np.unpackbits(bits.numpy()[row].view(np.uint8), count=count, bitorder="little")
     return flags.view(np.bool_)

@@ -48,7 +48,7 @@ def smooth_planes(
     Returns all planes.
     """
     are_served = kernels.serve(points, *neighbors, *planes, noise, k=neighbors.indices.shape[1])
-    table = _table(points, planes, errors) if are_served else planes.normals.T.contiguous()
+    table = _table(points, planes, errors) if are_served else points
     parameters = (
         constants.SMOOTHING_AGREEMENT,
         constants.SMOOTHING_REACH,
@@ -60,7 +60,7 @@ def smooth_planes(
     def find(chosen: Tensor) -> Sequence[Tensor]:
         if are_served:
             return kernels.call("smooth_planes", table, *neighbors, noise, chosen, *parameters)
-        return _smooth_rows(points, *neighbors, table, planes.offsets, noise, errors, chosen)
+        return _smooth_rows(points, neighbors, planes, noise, errors, chosen)
 
     return _replace_planes(planes, rows, chunk_size, find)
 
@@ -86,19 +86,17 @@ def _table(points: Tensor, planes: TangentPlanes, values: Tensor) -> Tensor:
 
 def _smooth_rows(
     points: Tensor,
-    indices: Tensor,
-    valid: Tensor | None,
-    parts: Tensor,
-    offsets: Tensor,
+    neighbors: Neighbors,
+    planes: TangentPlanes,
     noise: Tensor,
     errors: Tensor,
     rows: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Return the smoothed planes of points; ``parts`` are the columns of all normals."""
-    near = Neighbors(indices, valid).select(rows)
-    columns = gather_columns(points, near.indices)
-    x, y, z = (near.gather(column) for column in parts.unbind())
-    a, b, c = (column.index_select(0, rows)[:, None] for column in parts.unbind())
+    """Return the smoothed planes of points."""
+    near = neighbors.select(rows)
+    columns, (normals, offsets) = gather_columns(points, near.indices), planes
+    x, y, z = (near.gather(column) for column in normals.unbind(dim=1))
+    a, b, c = normals[rows, :, None].unbind(dim=1)
     cosines = x * a + y * b + z * c
     sign = signs(cosines)
     distances = -(x * columns[0] + y * columns[1] + z * columns[2]) - near.gather(offsets)
@@ -116,10 +114,10 @@ def _smooth_rows(
     length = rounded_sqrt(dot(mean, mean))
     has_mean = length > 0
     divisor = torch.where(has_mean, length, 1.0)
-    normals = torch.where(has_mean[:, None], mean / divisor[:, None], torch.cat([a, b, c], dim=1))
+    smoothed = torch.where(has_mean[:, None], mean / divisor[:, None], normals[rows])
     total = torch.where(has_mean, sum_neighbors(weights * sign), 1.0)
     new_offsets = -sum_neighbors(weights * distances) / total
-    return normals, torch.where(has_mean, new_offsets, offsets[rows])
+    return smoothed, torch.where(has_mean, new_offsets, offsets[rows])
 
 
 def choose_planes(
@@ -154,7 +152,7 @@ def choose_planes(
     def find(chosen: Tensor) -> Sequence[Tensor]:
         if are_served:
             return kernels.call("choose_planes", table, *neighbors, points, chosen, *parameters)
-        return _best_neighbor_planes(points, *neighbors, *planes, noise, chosen, ranks)
+        return _best_neighbor_planes(points, neighbors, planes, noise, chosen, ranks)
 
     at_once = ROWS_IN_CACHE // (1 if are_served else len(ranks))
     size = min(chunk_size, limit_rows(at_once, neighbors.indices.shape[1]))
@@ -163,17 +161,15 @@ def choose_planes(
 
 def _best_neighbor_planes(
     points: Tensor,
-    indices: Tensor,
-    valid: Tensor | None,
-    normals: Tensor,
-    offsets: Tensor,
+    neighbors: Neighbors,
+    planes: TangentPlanes,
     noise: Tensor,
     rows: Tensor,
     ranks: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Return the best planes of points among the planes of their neighbors at ``ranks``."""
-    near = Neighbors(indices, valid).select(rows)
-    columns = gather_columns(points, near.indices)
+    near = neighbors.select(rows)
+    columns, (normals, offsets) = gather_columns(points, near.indices), planes
     weights = _distance_weights(columns, constants.VOTE_FALLOFF)
     if near.valid is not None:
         weights *= near.valid
@@ -217,7 +213,7 @@ def standard_errors(
     errors: Tensor = 2 * survey.noise / (radius * num_points**0.5)
 
     def work(rows: Tensor) -> None:
-        count, values = _inliers(points, *neighbors, *planes, survey.noise, rows)
+        count, values = _inliers(points, neighbors, planes, survey.noise, rows)
         width = (count * values[:, 1].clamp(min=0)).sqrt_()
         error = survey.noise[rows] / torch.where(width > 0, width, survey.noise[rows])
         errors[rows] = torch.maximum(errors[rows], error)
@@ -240,7 +236,7 @@ def describe_inliers(
     curvature, residual_rms = fit.curvature.clone(), fit.residual_rms.clone()
 
     def work(rows: Tensor) -> None:
-        _, values = _inliers(points, *neighbors, *planes, noise, rows)
+        _, values = _inliers(points, neighbors, planes, noise, rows)
         smallest, total = values[:, 0].clamp(min=0), values.clamp(min=0).sum(dim=1)
         bent = (smallest - noise[rows].square()).clamp_(min=0)
         curvature[rows] = bent / torch.where(total > 0, total, 1.0)
@@ -251,22 +247,16 @@ def describe_inliers(
 
 
 def _inliers(
-    points: Tensor,
-    indices: Tensor,
-    valid: Tensor | None,
-    normals: Tensor,
-    offsets: Tensor,
-    noise: Tensor,
-    rows: Tensor,
+    points: Tensor, neighbors: Neighbors, planes: TangentPlanes, noise: Tensor, rows: Tensor
 ) -> tuple[Tensor, ...]:
     """Return the number and covariance eigenvalues of neighbors near the planes of points."""
-    arguments = points, indices, valid, normals, offsets, noise
-    if kernels.serve(*arguments, k=indices.shape[1]):
+    arguments = points, *neighbors, *planes, noise
+    if kernels.serve(*arguments, k=neighbors.indices.shape[1]):
         return kernels.call("inliers", *arguments, rows, constants.INLIER_REACH)
-    columns = gather_columns(points, indices[rows])
-    distances = residuals(columns, normals[rows], offsets[rows]).abs()
+    columns = gather_columns(points, neighbors.indices[rows])
+    distances = residuals(columns, planes.normals[rows], planes.offsets[rows]).abs()
     near = distances <= (constants.INLIER_REACH * noise[rows])[:, None]
-    weights = (near & Neighbors(indices, valid).mask(rows)).to(points.dtype)
+    weights = (near & neighbors.mask(rows)).to(points.dtype)
     return weights.sum(dim=1), fit_weighted_planes(columns, weights)[2]
 
 
