@@ -220,7 +220,9 @@ def _fit_edges(
     turned, current, limit = points.select(rows), normals[rows], limit[rows]
     axis = torch.linalg.cross(torch.linalg.cross(start[rows], current), current)
     across = axis / (axis * axis).sum(dim=-1, keepdim=True).sqrt()
-    mu = _low_quantile(_sq_distances(turned, across), turned.counted)
+    sq_distances = _sq_distances(turned, across).where(turned.counted > 0, torch.inf)
+    rank = (_SECOND_START * turned.counted.sum(dim=-1, keepdim=True)).long()
+    mu = sq_distances.sort(dim=-1).values.gather(-1, rank)
     second = _fit_twice(turned, across, mu, mu / 2, limit, decay)
     firsts = _Solution(*(field[rows] for field in first))
     better = (_cosine(firsts.through, second.through) < _SAME_COSINE) & ~_first_wins(
@@ -265,13 +267,6 @@ def _sq_distances(points: _Offsets, normal: Tensor) -> Tensor:
     """Return squared distances to planes through the points themselves, 0 if not counted."""
     distances = points.distances(normal)
     return distances * distances * points.counted
-
-
-def _low_quantile(values: Tensor, counted: Tensor) -> Tensor:
-    """Return the 35th percentile of the counted values, shape ``(n, 1)``."""
-    ordered = torch.where(counted > 0, values, torch.inf).sort(dim=-1).values
-    rank = (_SECOND_START * counted.sum(dim=-1, keepdim=True)).long()
-    return ordered.gather(-1, rank)
 
 
 def _cosine(a: Tensor, b: Tensor) -> Tensor:

@@ -262,11 +262,10 @@ def _orthogonal_direction(edges: list[list[Tensor]], like: list[Tensor]) -> list
         normal = [u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0]
     else:
         matrix = torch.stack([torch.stack(edge, dim=-1) for edge in edges], dim=-2)
-        minors = []
+        normal = []
         for j in range(size):
             others = [i for i in range(size) if i != j]
-            minors.append(torch.linalg.det(matrix[..., others]) * (-1) ** j)
-        normal = minors
+            normal.append(torch.linalg.det(matrix[..., others]) * (-1) ** j)
     length = sum_squares(normal).sqrt()
     length = torch.where(length > 0, length, 1.0)
     return [component / length for component in normal]

@@ -170,8 +170,9 @@ def fit_meeting_planes(
     start = MeetingPlanes(*(values[rows] for values in two))
     limit = constants.CORNER_FRACTION * start.deviations
     best = start._replace(deviations=limit)
+    first, third = wedge.first[rows], _off_surface(wedge.outer[rows], noise[rows])
     for groups in (
-        split_off(wedge.first[rows], wedge.outer[rows], noise[rows]),
+        (first * (1 - third), (1 - first) * (1 - third), third),
         split_by_votes(corners, normals[rows], offsets[rows], noise[rows]),
     ):
         found = fit_corners(corners, groups)
@@ -236,12 +237,6 @@ def fit_corners(columns: Columns, groups: Sequence[Tensor]) -> MeetingPlanes:
         first = above(inside[1], inside[0]).mul_(1 - third)
         second = 1 - third - first
     return _summary(planes, (first, second, third), outer, present)
-
-
-def split_off(first: Tensor, outer: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the two groups of a wedge, and the points off it on its fuller side as a third."""
-    third = _off_surface(outer, noise)
-    return first * (1 - third), (1 - first) * (1 - third), third
 
 
 def split_by_votes(
