@@ -4,7 +4,7 @@ from pathlib import Path
 
 TESTS = Path(__file__).parent
 PACKAGE = TESTS.parent / "torchrg"
-MAX_WITHOUT_TESTS = 10
+MAX_WITHOUT_TESTS = 9
 """Modules that only the tests of other modules reach; lower it, and never raise it."""
 
 
