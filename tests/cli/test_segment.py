@@ -94,6 +94,9 @@ def test_the_number_of_sites_is_said(rooms, tmp_path, run):
     points = read_cloud(rooms / "b.npz").points
     num_sites = len(sample_voxels(points, 0.2).rows)
     assert f"{num_sites:,} sites, one of the 20,000 points per voxel" in done.out
+    done = run("segment", *files, "--limit-memory", LIMIT)
+    (voxel,) = re.findall(r"--voxel ([\d.]+) would segment about half of the points", done.out)
+    assert 0.4 < len(sample_voxels(points, float(voxel)).rows) / len(points) < 0.55
 
 
 def test_the_file_is_read_to_the_disk(rooms, tmp_path, run, monkeypatch):
