@@ -240,7 +240,7 @@ def _read_parts(path: Path, num_points: int) -> Case:
 def _small(layout: RoomLayout, **counts: int) -> RoomLayout:
     """Return the layout for a small room with few objects, dense at 50,000 points."""
     nothing = {field.name: 0 for field in fields(layout) if field.name.startswith("num_")}
-    return replace(layout, size=(4.4, 3.4, 2.4), **{**nothing, "num_viewpoints": 1, **counts})
+    return replace(layout, size=(4.4, 3.4, 2.4), **{**nothing, **counts})
 
 
 _ROOM_POINTS = 30_000

@@ -41,11 +41,11 @@ from benchmarks.harness import Benchmark, Figures, Results, markdown, medians, r
 from benchmarks.patches import label_patches
 from benchmarks.peers import MIN_SIZE, OPEN3D, pcl_command
 from benchmarks.protocols import count_segcomp, score_evops, score_voxels
-from tests.made import DepthFrame, cameras_around, render_depth
+from tests.made import DepthFrame, build_scanned_room, cameras_around, render_depth
 from torchrg.depth import segment_depth
 from torchrg.depth.camera import depth_to_points
 from torchrg.metrics import contingency_table, score_labels
-from torchrg.scenes import build_room, make_room
+from torchrg.scenes import make_room
 
 PRESETS = ("classic", "paper", "consensus")
 NOISES = (0.0005, 0.001, 0.003, 0.006)
@@ -187,7 +187,7 @@ def _synthetic_room(num_points: int, noise: float) -> Clouds:
 
 def _frames(sensor: str, scale: float) -> Clouds:
     """Return depth frames of a synthetic room as clouds."""
-    model = build_room(FRAME_SEED)
+    model = build_scanned_room(FRAME_SEED)
     height = max(round(480 * scale**0.5), 60)
     size = {"width": height * 4 // 3, "height": height}
     clouds = []

@@ -20,7 +20,7 @@ import torch
 
 import torchrg
 from benchmarks.harness import Benchmark, Figures, Results, Worker, markdown, medians, ratio
-from tests.made import cameras_around, render_depth
+from tests.made import build_scanned_room, cameras_around, render_depth
 
 PRESETS = ("classic", "paper", "consensus")
 FRAMES = {"depth": (480, "exact"), "depth-kinect": (480, "kinect"), "depth-large": (960, "exact")}
@@ -119,7 +119,7 @@ def prepare(name: str, size: int) -> Callable[[], None]:
     """Return the task of a process, after a warm-up run."""
     if name in FRAMES:
         height, sensor = FRAMES[name]
-        model = torchrg.scenes.build_room(SEED)
+        model = build_scanned_room(SEED)
         camera = cameras_around(model, 1, width=height * 4 // 3, height=height)[0]
         depth = render_depth(model, camera, sensor=sensor).depth
         segment = partial(torchrg.depth.segment_depth, depth, camera.intrinsics)

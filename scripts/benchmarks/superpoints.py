@@ -27,6 +27,7 @@ from torch import Tensor
 from benchmarks.harness import Benchmark, Figures, Results, markdown
 from tests.made import (
     CurvedLayout,
+    build_scanned_room,
     in_pieces,
     make_kinect_room,
     objects_of,
@@ -36,7 +37,7 @@ from tests.made import (
 from torchrg import make_superpoints, read_cloud, segment_planes
 from torchrg.config import SuperpointsConfig
 from torchrg.metrics import score_partition
-from torchrg.scenes import Scene, build_room, make_room
+from torchrg.scenes import Scene, make_room
 from torchrg.structures import UNLABELED
 
 VOXEL = 0.03
@@ -144,7 +145,7 @@ CLOUDS: dict[str, tuple[str, Callable[[int], Scene]]] = {
     ),
     "scan": (
         "scan near and far",
-        lambda size: scan_scene(build_room(13, layout=LAYOUT), size, noise=NOISE, seed=13),
+        lambda size: scan_scene(build_scanned_room(13, layout=LAYOUT), size, noise=NOISE, seed=13),
     ),
     "frames": ("depth frames fused", lambda size: make_kinect_room(size, num_frames=8, seed=14)),
 }

@@ -16,6 +16,7 @@ from tests.made import (
     CURVED_LAYOUT,
     HALL_LAYOUT,
     KINECT_LAYOUT,
+    build_scanned_room,
     make_kinect_room,
     make_mapped_room,
     make_storey,
@@ -27,7 +28,7 @@ from torchrg import estimate_normals, load_config, search_knn, segment_planes
 from torchrg.config import NormalsConfig
 from torchrg.io import read_cloud
 from torchrg.io.files import hash_file
-from torchrg.scenes import Scene, build_room, make_room
+from torchrg.scenes import Scene, make_room
 from torchrg.structures import UNLABELED, Neighbors, NormalFit
 
 POINTS = {"tutorial": 108_104, "hallway": 579_313, "cory": 1_097_901, "kinect": 968_520}
@@ -178,12 +179,12 @@ _DISPARITY_SCALE = 525 * 0.075 * 8
 def _laser_hall(quick: bool) -> Scene:
     """Return a laser scan of a hallway, the substitute for the tutorial's cloud."""
     layout, size = (_PIECE, 30_000) if quick else (_SHORT_HALL, POINTS["tutorial"])
-    return scan_scene(build_room(2, layout=layout), size, noise=_NOISE)
+    return scan_scene(build_scanned_room(2, layout=layout), size, noise=_NOISE)
 
 
 def _depth_room(quick: bool, quantise: Callable[[Tensor], Tensor]) -> Scene:
     """Return a noise-free depth frame with quantized depth."""
-    model = build_room(layout=KINECT_LAYOUT)
+    model = build_scanned_room(layout=KINECT_LAYOUT)
     return quantised_frame(model, quantise, 30_000 if quick else 250_000)
 
 

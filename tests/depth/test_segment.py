@@ -6,7 +6,7 @@ import pickle
 import pytest
 import torch
 
-from tests.made import cameras_around, render_depth
+from tests.made import build_scanned_room, cameras_around, render_depth
 from tests.made.cameras import KINECT_LAYOUT
 from torchrg.depth import DepthConfig, segment_depth
 from torchrg.depth.camera import find_intrinsics, make_intrinsics
@@ -14,7 +14,6 @@ from torchrg.errors import ShapeError
 from torchrg.io import read_cloud
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.metrics import score_labels
-from torchrg.scenes import build_room
 from torchrg.structures import UNLABELED
 from torchrg.structures.planes import PLANE_COLUMNS
 
@@ -22,7 +21,7 @@ SMALL = make_intrinsics(100.0, 100.0, 79.5, 59.5)
 
 
 def rendered(seed, camera, *, sensor, width=640, height=480):
-    model = build_room(seed, layout=KINECT_LAYOUT)
+    model = build_scanned_room(seed, layout=KINECT_LAYOUT)
     cameras = cameras_around(model, 4, seed=seed, width=width, height=height)
     return render_depth(model, cameras[camera], sensor=sensor, seed=seed)
 

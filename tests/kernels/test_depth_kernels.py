@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from tests.kernels.clouds import definitions, needs_library
-from tests.made import cameras_around, render_depth
+from tests.made import build_scanned_room, cameras_around, render_depth
 from torchrg.config import DepthConfig
 from torchrg.depth import segment_depth
 from torchrg.depth.camera import make_intrinsics
@@ -13,7 +13,6 @@ from torchrg.depth.growth import PixelGrid, fit_inverse_planes
 from torchrg.depth.pixels import InverseCloud
 from torchrg.linalg.moments import Segments, kth_smallest
 from torchrg.regions.extents import hull_candidates
-from torchrg.scenes import build_room
 from torchrg.structures.planes import PLANE_COLUMNS
 
 pytestmark = pytest.mark.skipif(not needs_library, reason="needs the library of kernels")
@@ -22,7 +21,7 @@ pytestmark = pytest.mark.skipif(not needs_library, reason="needs the library of 
 def frames():
     """Depth images by name: made, noisy, exact, with holes, random, tiny, huge and thin ones."""
     generator = torch.Generator().manual_seed(0)
-    model = build_room(3)
+    model = build_scanned_room(3)
     camera = cameras_around(model, 1, seed=3, width=150, height=113)[0]
     made = {kind: render_depth(model, camera, sensor=kind).depth for kind in ("exact", "kinect")}
     broken = made["kinect"].clone()

@@ -1,7 +1,8 @@
 """Scenes in addition to furnished rooms: curved rooms, storeys, scans, depth frames, shapes.
 
 To add a scene, return a :class:`torchrg.scenes.SceneModel` from a function here: parts (surfaces,
-each a face, and solids that hide what is inside them) and places where a scanner may stand.
+each a face, and solids that hide what is inside them), or a ``scanners.ScannedModel``, with places
+where a scanner may stand.
 :func:`torchrg.scenes.sample_scene` turns it into a cloud with truth. A new kind of surface has the
 properties and methods of ``scenes.surfaces.Surface``, and a function in ``rays`` if it is
 scanned. A part of the report takes it once it has a key in ``reproduction.clouds``, or in
@@ -29,6 +30,7 @@ from tests.made.samples import (
     on_voxels,
     quantised_frame,
 )
+from tests.made.scanners import ScannedLayout, build_scanned_room
 from tests.made.shapes import SHAPES, make_shape
 from tests.made.storeys import (
     HALL_LAYOUT,
@@ -45,6 +47,8 @@ __all__ = [
     "Camera",
     "CurvedLayout",
     "DepthFrame",
+    "ScannedLayout",
+    "build_scanned_room",
     "build_storey",
     "cameras_around",
     "cast_rays",

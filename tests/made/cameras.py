@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from tests.made.rays import cast_rays
-from torchrg.scenes import RoomLayout, Scene, SceneModel, build_room
+from tests.made.scanners import ScannedLayout, ScannedModel, build_scanned_room
+from torchrg.scenes import Scene, SceneModel
 from torchrg.scenes.geometry import Doubles, Frame, unit
 from torchrg.scenes.scene import label_points
 from torchrg.structures import UNLABELED
@@ -40,7 +41,7 @@ _KINECT2_NOISE = (0.0015, -0.0005, 0.0003)
 _KINECT2_SIZE, _KINECT2_FOCAL = (512, 424), 365.0
 """Pixels."""
 
-KINECT_LAYOUT = RoomLayout(
+KINECT_LAYOUT = ScannedLayout(
     size=(5.4, 4.4, 2.6),
     num_doors=1,
     num_windows=1,
@@ -112,7 +113,7 @@ class Camera:
 
 
 def cameras_around(
-    model: SceneModel, num_cameras: int, *, seed: int = 0, width: int = 640, height: int = 480
+    model: ScannedModel, num_cameras: int, *, seed: int = 0, width: int = 640, height: int = 480
 ) -> list[Camera]:
     """Return cameras at the viewpoints of a scene, as of someone who turns around and looks down.
 
@@ -152,7 +153,7 @@ class DepthFrame(NamedTuple):
 
 
 def render_depth(
-    model: SceneModel, camera: Camera | None = None, *, sensor: Sensor = "exact", seed: int = 0
+    model: ScannedModel, camera: Camera | None = None, *, sensor: Sensor = "exact", seed: int = 0
 ) -> DepthFrame:
     """Render what a depth camera sees, by exact ray casting.
 
@@ -227,7 +228,7 @@ def make_kinect_room(
     The points are a random subset of the pixels with depth, in random order; normals are those of
     the faces, towards free space.
     """
-    model = build_room(seed, layout=KINECT_LAYOUT)
+    model = build_scanned_room(seed, layout=KINECT_LAYOUT)
     frames = [
         render_depth(model, camera, sensor=sensor, seed=seed * num_frames + number)
         for number, camera in enumerate(cameras_around(model, num_frames, seed=seed))
@@ -244,7 +245,10 @@ def make_mapped_room(
     exports its maps. The points are a random subset of these, in random order; face and normal are
     of one point in each.
     """
-    model, rng = build_room(seed, layout=KINECT_LAYOUT), np.random.default_rng([seed, _FUSION + 2])
+    model, rng = (
+        build_scanned_room(seed, layout=KINECT_LAYOUT),
+        np.random.default_rng([seed, _FUSION + 2]),
+    )
     width, height = _KINECT2_SIZE
     parts = []
     for number, camera in enumerate(

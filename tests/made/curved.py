@@ -6,9 +6,9 @@ from functools import partial
 from itertools import product
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from torchrg.scenes import RoomLayout
+from tests.made.scanners import ScannedLayout
 from torchrg.scenes.geometry import Doubles, Frame, unit
 from torchrg.scenes.parts import TABLE_HEIGHT
 from torchrg.scenes.rooms import Furniture
@@ -166,9 +166,35 @@ def _around_circles(radii: ArrayLike, heights: ArrayLike, sector: AngleRange) ->
     return np.array(list(product(*ends)))
 
 
+@dataclass(frozen=True, eq=False)
+class RoundSolid(Solid):
+    """A cylinder or a ball.
+
+    Args:
+        frame: Local coordinate frame at the center.
+        size: Lengths along the three axes.
+        num_round: Number of round axes: 2 (cylinder, the first two) or 3 (ball).
+
+    Example:
+        >>> drum = RoundSolid(Frame.upright(np.zeros(3)), (2, 2, 1), num_round=2)
+        >>> drum.contains(np.array([[0.7, 0.7, 0.5], [0.8, 0.8, 0.5]])).tolist()
+        [True, False]
+    """
+
+    num_round: int = 3
+
+    def contains(self, points: Doubles) -> NDArray[np.bool_]:
+        """Return the mask of points of shape ``(N, 3)`` inside or on it."""
+        fractions = 2 * np.abs(self.frame.to_local(points)) / self.size
+        curved, straight = fractions[:, : self.num_round], fractions[:, self.num_round :]
+        inside: NDArray[np.bool_] = np.vecdot(curved, curved) <= 1
+        return inside & (straight <= 1).all(axis=1)
+
+
 def _drum(base: Frame, radius: float, height: float) -> Solid:
     """Return a cylindrical body on the plane of its frame's first two axes."""
-    return Solid(base.moved(0, 0, height / 2), (2 * radius, 2 * radius, height), num_round=2)
+    size = (2 * radius, 2 * radius, height)
+    return RoundSolid(base.moved(0, 0, height / 2), size, num_round=2)
 
 
 def draw_round_table(rng: np.random.Generator, frame: Frame, thickness: float) -> Part:
@@ -213,11 +239,11 @@ def _post(kind: str, frame: Frame, radius: float, height: float) -> Part:
 def _ball(kind: str, middle: Frame, radius: float) -> Part:
     """Return a ball about the origin of a frame."""
     size = (2 * radius, 2 * radius, 2 * radius)
-    return Part((Ring(kind, middle, 0, radius),), (Solid(middle, size, num_round=3),))
+    return Part((Ring(kind, middle, 0, radius),), (RoundSolid(middle, size),))
 
 
 @dataclass(frozen=True)
-class CurvedLayout(RoomLayout):
+class CurvedLayout(ScannedLayout):
     """A room with round things on its floor and bent walls, with nothing on them."""
 
     num_columns: int = 0

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tests.made.curved import Cone, Ring
+from tests.made.scanners import ScannedModel
 from torchrg.scenes import Scene, SceneModel
 from torchrg.scenes.geometry import Doubles, unit
 from torchrg.scenes.scene import label_points
@@ -99,7 +100,7 @@ def _may_meet(cones: tuple[Doubles, Doubles], bounds: Doubles) -> NDArray[np.boo
     return angles <= half_angles + np.arcsin(radius / distance)
 
 
-def scan_scene(model: SceneModel, num_points: int, *, noise: float = 0.0, seed: int = 0) -> Scene:
+def scan_scene(model: ScannedModel, num_points: int, *, noise: float = 0.0, seed: int = 0) -> Scene:
     """Return what a laser scanner at each viewpoint sees, in equal steps of azimuth and elevation.
 
     Each viewpoint has the same number of points, up to one; a few of the rays are dropped at random

@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 
 from tests.made.cameras import cameras_around, fuse_frames, render_depth
+from tests.made.scanners import ScannedModel
 from torchrg.neighbors import sample_voxels, search_knn
-from torchrg.scenes import Scene, SceneModel
+from torchrg.scenes import Scene
 from torchrg.structures import UNLABELED
 
 OUTLIERS = ("cluster", "shell", "far")
@@ -68,7 +69,7 @@ def drawn_from_triangles(scene: Scene, num_points: int, *, seed: int = 0) -> Sce
 
 
 def quantised_frame(
-    model: SceneModel, quantise: Callable[[Tensor], Tensor], num_points: int
+    model: ScannedModel, quantise: Callable[[Tensor], Tensor], num_points: int
 ) -> Scene:
     """Return points of one depth frame without noise, whose depth goes through a function."""
     frame = render_depth(model, cameras_around(model, 1)[0])

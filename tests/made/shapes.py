@@ -37,7 +37,7 @@ def make_shape(
         >>> float(cube.points.abs().max()), len(cube.kinds)
         (0.5, 6)
     """
-    model = SceneModel((Part(SHAPES[name]()),), np.full((1, 3), 10.0))
+    model = SceneModel((Part(SHAPES[name]()),))
     low, high = box_around(np.concatenate([surface.bounds for surface in model.surfaces]))
     noise = noise_fraction * float(np.sqrt(((high - low) ** 2).sum()))
     return sample_scene(model, num_points, noise=noise, seed=seed, noise_direction=noise_direction)
@@ -55,9 +55,12 @@ class Fan(Flat):
         corner, first, second = self.cells.swapaxes(0, 1)
         return append_zero(np.concatenate([corner, corner + first, corner + second]))
 
-    def _edge_fractions(self, first: Doubles, second: Doubles) -> tuple[Doubles, Doubles]:
-        beyond = first + second > 1
-        return np.where(beyond, 1 - first, first), np.where(beyond, 1 - second, second)
+    def _draw(self, rng: np.random.Generator, count: int) -> Doubles:
+        counts = rng.multinomial(count, self._cell_areas / self._cell_areas.sum())
+        fractions = rng.random((2, count))
+        first, second = np.where(fractions.sum(axis=0) > 1, 1 - fractions, fractions)
+        corner, edge, other = self.cells[np.repeat(np.arange(len(counts)), counts)].swapaxes(0, 1)
+        return append_zero(corner + (first[:, None] * edge + second[:, None] * other))
 
 
 @dataclass(frozen=True, eq=False)

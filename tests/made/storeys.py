@@ -4,14 +4,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from torchrg.scenes import RoomLayout, Scene, SceneModel, sample_scene
+from tests.made.scanners import ScannedLayout, ScannedModel, scanner_positions
+from torchrg.scenes import Scene, sample_scene
 from torchrg.scenes.geometry import Frame
 from torchrg.scenes.parts import block, passage, room_walls
-from torchrg.scenes.rooms import furnish, scanner_positions
+from torchrg.scenes.rooms import furnish
 from torchrg.scenes.scene import Part
 from torchrg.scenes.surfaces import Flat, Hole
 
-HALL_LAYOUT = RoomLayout(
+HALL_LAYOUT = ScannedLayout(
     size=(24.0, 2.4, 2.7),
     num_doors=14,
     num_windows=1,
@@ -29,7 +30,7 @@ HALL_LAYOUT = RoomLayout(
 
 _HALL = replace(HALL_LAYOUT, size=(24.0, 2.4, 2.5), num_doors=2, num_cabinets=1, num_panels=2)
 """The hallway of a storey; its length is that of the rooms."""
-_ROOM = RoomLayout(
+_ROOM = ScannedLayout(
     num_doors=0,
     num_windows=1,
     num_cabinets=1,
@@ -70,7 +71,7 @@ def make_storey(
     return sample_scene(model, num_points, noise=noise, seed=seed)
 
 
-def build_storey(seed: int = 0, *, rooms_per_side: int = 4) -> SceneModel:
+def build_storey(seed: int = 0, *, rooms_per_side: int = 4) -> ScannedModel:
     """Build the description of a hallway and the rooms on both sides of it.
 
     The floor, which is the first face, runs through the open doors; every ceiling is at a height of
@@ -83,16 +84,16 @@ def build_storey(seed: int = 0, *, rooms_per_side: int = 4) -> SceneModel:
     hall = Frame.upright(np.zeros(3))
     walls = room_walls(hall, hall_layout.size)
     doorways = [(room.hall_wall, room.hall_doorway(length)) for room in rooms]
-    hall_parts = furnish(hall_layout, hall, rng, doorways=doorways, with_floor=False)
+    hall_parts = _without_floor(furnish(hall_layout, hall, rng, doorways=doorways))
     parts: list[Part] = [Part((_floor(rooms, length, width),)), *hall_parts]
     viewpoints = [scanner_positions(hall_layout, hall, hall_parts, rng)]
     for room, (wall, doorway) in zip(rooms, doorways, strict=True):
         layout, holes = replace(_ROOM, size=room.size), [(_FIRST_WALL, room.doorway)]
-        contents = furnish(layout, room.frame, rng, doorways=holes, with_floor=False)
+        contents = _without_floor(furnish(layout, room.frame, rng, doorways=holes))
         parts += [passage("door frame", walls[wall], doorway, room.thickness), *contents]
         parts.append(_open_door(room, rng))
         viewpoints.append(scanner_positions(layout, room.frame, parts, rng))
-    return SceneModel(tuple(parts), np.concatenate(viewpoints))
+    return ScannedModel(tuple(parts), np.concatenate(viewpoints))
 
 
 @dataclass(frozen=True)
@@ -157,6 +158,12 @@ def _spread(rng: np.random.Generator, count: int, ends: tuple[float, float]) -> 
     steps = rng.permutation(count) + 0.25 + rng.random(count) / 2
     low, high = ends
     return [float(value) for value in low + (high - low) * steps / count]
+
+
+def _without_floor(parts: tuple[Part, ...]) -> tuple[Part, ...]:
+    """Return the parts of a room without its first face, the floor."""
+    shell, *others = parts
+    return Part(shell.surfaces[1:], shell.solids), *others
 
 
 def _floor(rooms: list[_Room], length: float, width: float) -> Flat:

@@ -6,11 +6,11 @@ import torch
 
 import torchrg as segmentator
 from tests.made.cameras import cameras_around, render_depth
+from tests.made.scanners import build_scanned_room
 from torchrg.config import SuperpointsConfig, load_config
 from torchrg.errors import ShapeError
 from torchrg.metrics import score_partition
 from torchrg.pipeline import make_superpoints, segment_planes
-from torchrg.scenes import build_room
 
 CLASSIC = load_config("classic")
 
@@ -26,7 +26,7 @@ def grid_faces(height, width):
 @pytest.fixture(scope="module")
 def mesh():
     """A frame of a Kinect in a made room as a mesh, without the triangles across steps."""
-    model = build_room(seed=2)
+    model = build_scanned_room(seed=2)
     (camera,) = cameras_around(model, 1, width=96, height=72)
     frame = render_depth(model, camera, sensor="kinect")
     vertices = (torch.from_numpy(camera.rays()) * frame.depth[..., None]).reshape(-1, 3).float()

@@ -9,6 +9,8 @@ from tests.made import (
     SHAPES,
     Camera,
     CurvedLayout,
+    ScannedLayout,
+    build_scanned_room,
     build_storey,
     cameras_around,
     cast_rays,
@@ -20,7 +22,7 @@ from tests.made import (
 )
 from tests.made.rays import solve_quadratic
 from torchrg.neighbors import search_knn
-from torchrg.scenes import RoomLayout, build_room, make_room
+from torchrg.scenes import make_room
 from torchrg.scenes.geometry import unit
 from torchrg.scenes.scene import is_occupied, plane_equations
 from torchrg.structures import UNLABELED
@@ -206,7 +208,7 @@ def _triangles(surface):
 
 
 def test_nearest_hit_is_that_of_brute_force_over_triangles():
-    model = build_room(1)
+    model = build_scanned_room(1)
     origin = model.viewpoints[0]
     directions = unit(np.random.default_rng(0).standard_normal((2, 25, 3)))
     hits = cast_rays(model, origin, directions)
@@ -221,7 +223,7 @@ def test_nearest_hit_is_that_of_brute_force_over_triangles():
 
 @pytest.mark.parametrize("seed", range(3))
 def test_path_to_the_nearest_hit_is_free_and_what_is_behind_is_not(seed):
-    model = build_room(seed, layout=CURVED)
+    model = build_scanned_room(seed, layout=CURVED)
     origin, steps = model.viewpoints[0], unit(np.random.default_rng(0).standard_normal((1000, 3)))
     distances, faces = (values[0] for values in cast_rays(model, origin, steps[None]))
     for fraction in np.linspace(0.01, 0.9999, 60):
@@ -234,7 +236,7 @@ def test_path_to_the_nearest_hit_is_free_and_what_is_behind_is_not(seed):
 
 
 @pytest.mark.parametrize(
-    "model", [build_room(0), build_room(5, layout=CURVED)], ids=["room", "curved"]
+    "model", [build_scanned_room(0), build_scanned_room(5, layout=CURVED)], ids=["room", "curved"]
 )
 def test_no_ray_escapes_not_even_into_seams(model):
     origin = model.viewpoints[0]
@@ -248,6 +250,23 @@ def test_rays_along_the_sides_of_a_cone_are_solved_without_loss():
     # (1e-20 t^2 - 2 t + 1) has roots near 2e20 and 0.5; the usual formula loses the second.
     roots = solve_quadratic(np.array([1e-20]), np.array([-1.0]), np.array([1.0]))
     assert sorted(root[0] for root in roots) == pytest.approx([0.5, 2e20])
+
+
+@pytest.mark.parametrize("layout", [ScannedLayout(), CURVED], ids=["flat", "curved"])
+def test_rooms_of_any_seed_have_free_viewpoints(layout):
+    around = np.random.default_rng(0).uniform(-0.15, 0.15, (500, 3))
+    for seed in range(5):
+        model = build_scanned_room(seed, layout=layout)
+        assert not is_occupied(model.parts, model.viewpoints[0] + around).any()
+        assert len(model.surfaces) == len(model.objects)
+
+
+def test_viewpoints_keep_a_metre_from_bodies_where_there_is_space():
+    layout = ScannedLayout(num_tables=0, num_small_boxes=0, num_boxes=0, num_pillars=3)
+    around = np.random.default_rng(0).uniform(-0.9, 0.9, (2000, 3))
+    models = [build_scanned_room(seed, layout=layout) for seed in range(6)]
+    free = [not is_occupied(model.parts, model.viewpoints[0] + around).any() for model in models]
+    assert sum(free) >= 5
 
 
 # Depth frames.
@@ -268,7 +287,7 @@ def test_camera_projects_by_its_intrinsics_and_pose():
 
 
 def test_depth_frame_lies_on_the_faces_it_names():
-    model = build_room(4)
+    model = build_scanned_room(4)
     planes, offsets = (torch.from_numpy(values) for values in plane_equations(model.surfaces))
     frame = render_depth(model, cameras_around(model, 1, width=160, height=120)[0])
     rays, pose = torch.from_numpy(frame.camera.rays()), frame.camera.pose
@@ -292,7 +311,7 @@ SENSORS = {
 
 @pytest.mark.parametrize("sensor", SENSORS)
 def test_noise_of_a_sensor_is_that_of_its_model(sensor):
-    model = build_room(0)
+    model = build_scanned_room(0)
     camera = cameras_around(model, 1)[0]
     exact, noisy = render_depth(model, camera), render_depth(model, camera, sensor=sensor)
     (deviation, step, _), valid = SENSORS[sensor], noisy.depth > 0
@@ -312,7 +331,7 @@ def test_noise_of_a_sensor_is_that_of_its_model(sensor):
 
 @pytest.mark.parametrize("sensor", SENSORS)
 def test_sensors_drop_what_is_out_of_range(sensor):
-    model = build_room(0, layout=RoomLayout(size=(16.0, 7.0, 2.8)))
+    model = build_scanned_room(0, layout=ScannedLayout(size=(16.0, 7.0, 2.8)))
     camera = Camera.looking((0.5, 3.5, 1.6), (15, 3.5, 1.5), width=160, height=120)
     exact, noisy = render_depth(model, camera), render_depth(model, camera, sensor=sensor)
     nearest, furthest = SENSORS[sensor][2]

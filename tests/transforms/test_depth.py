@@ -5,12 +5,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.made import cameras_around, render_depth
+from tests.made import build_scanned_room, cameras_around, render_depth
 from torchrg.datasets import RGBDFrame
 from torchrg.depth import segment_depth
 from torchrg.depth.camera import depth_to_points, find_intrinsics, make_intrinsics
 from torchrg.errors import ConfigError, ShapeError
-from torchrg.scenes import build_room
 from torchrg.structures import UNLABELED, Planes
 from torchrg.transforms import DepthToCloud, SegmentDepth, fuse_depth
 
@@ -18,7 +17,7 @@ from torchrg.transforms import DepthToCloud, SegmentDepth, fuse_depth
 @pytest.fixture(scope="module")
 def frames():
     """Three small frames of one room, the last without depth in a corner."""
-    model = build_room(1)
+    model = build_scanned_room(1)
     cameras = cameras_around(model, 3, seed=1, width=96, height=72)
     frames = [render_depth(model, camera) for camera in cameras]
     frames[2].depth[:20, :30] = 0

@@ -17,11 +17,6 @@ class Frame:
     Args:
         origin: Shape ``(3,)``.
         axes: The axes as rows, shape ``(3, 3)``, right-handed.
-
-    Example:
-        >>> frame = Frame.upright(np.array([1.0, 0, 0]), heading_deg=90)
-        >>> frame.to_world(np.array([[2.0, 0, 5]])).round(12).tolist()
-        [[1.0, 2.0, 5.0]]
     """
 
     origin: Doubles

@@ -15,13 +15,7 @@ TABLE_HEIGHT = (0.62, 0.92)
 
 
 def room_walls(room: Frame, size: Triple) -> list[Frame]:
-    """Return the frames of the four walls: first axis along the wall, second up, third inward.
-
-    Example:
-        >>> walls = room_walls(Frame.upright(np.zeros(3)), (4, 3, 2.5))
-        >>> [wall.axes[2].tolist()[:2] for wall in walls]
-        [[0.0, 1.0], [-1.0, 0.0], [0.0, -1.0], [1.0, 0.0]]
-    """
+    """Return the frames of the four walls: first axis along the wall, second up, third inward."""
     length, width, _ = size
     starts = ((length, 0, 0), (length, width, 0), (0, width, 0), (0, 0, 0))
     along = ((-1, 0, 0), (0, -1, 0), (1, 0, 0), (0, 1, 0))

@@ -17,7 +17,6 @@ from torchrg.scenes.scene import (
     Part,
     Scene,
     SceneModel,
-    is_occupied,
     plane_equations,
     sample_scene,
     seeded_generator,
@@ -27,7 +26,7 @@ from torchrg.scenes.surfaces import Hole, rectangle
 T = TypeVar("T")
 Furniture = Callable[[np.random.Generator, Frame], Part]
 """Function that creates an object at a position on the floor."""
-_ROOM = 100
+ROOM = 100
 """Purpose of the random numbers: sizes and positions in a room."""
 _FLOOR_CELL = (1.85, 1.35)
 """Size of a floor cell in meters: a table with space to walk around it."""
@@ -45,12 +44,8 @@ _TRIES = 1000
 """Maximum number of attempts to create an object without a face in the plane of another."""
 _PARALLEL = 1 - 0.02**2 / 2
 """Minimum cosine between parallel faces (about one degree)."""
-_CLEARANCES = (1.0, 0.6, 0.4, 0.2)
-"""Free space around a scanner in meters, in order of preference."""
 _MAX_SIDE, _MAX_COUNT = 1000, 1000
 """Maximum side of a room in meters, and number of objects of a kind; bounds the list of cells."""
-_POSITION_TRIES = 50
-"""Maximum number of attempts to find a scanner position with each clearance."""
 
 
 @dataclass(frozen=True)
@@ -80,8 +75,6 @@ class RoomLayout:
     """Rotation of the room about the up axis, in degrees."""
     min_plane_gap: float = 0.005
     """Minimum distance between a face and the plane of a parallel face."""
-    num_viewpoints: int = 1
-    """Number of scanner positions, spread along the room."""
 
     def __post_init__(self) -> None:
         check_values(self)
@@ -90,7 +83,7 @@ class RoomLayout:
             expect(self, name, f">= 0 and at most {_MAX_COUNT:,}", is_number)
         num_tables = self.num_tables
         expect(self, "num_small_boxes", f"<= {num_tables}", self.num_small_boxes <= num_tables)
-        for name in ("plate_thickness", "panel_thickness", "num_viewpoints"):
+        for name in ("plate_thickness", "panel_thickness"):
             expect(self, name, "> 0", getattr(self, name) > 0)
         is_size = min(self.size[:2]) >= 1 and self.size[2] >= 2.3 and max(self.size) <= _MAX_SIDE
         expect(self, "size", f"of at least 1 x 1 x 2.3 and at most {_MAX_SIDE:,} meters", is_size)
@@ -149,10 +142,8 @@ def build_room(seed: int = 0, *, layout: RoomLayout | None = None) -> SceneModel
         ['floor', 'ceiling', 'wall']
     """
     layout = layout or RoomLayout()
-    rng = seeded_generator(seed, _ROOM)
-    room = Frame.upright(np.zeros(3), layout.heading_deg)
-    parts = furnish(layout, room, rng)
-    return SceneModel(parts, scanner_positions(layout, room, parts, rng))
+    rng = seeded_generator(seed, ROOM)
+    return SceneModel(furnish(layout, Frame.upright(np.zeros(3), layout.heading_deg), rng))
 
 
 def furnish(
@@ -161,7 +152,6 @@ def furnish(
     rng: np.random.Generator,
     *,
     doorways: Sequence[tuple[int, Hole]] = (),
-    with_floor: bool = True,
 ) -> tuple[Part, ...]:
     """Return the parts of a room with a floor corner at its origin; the shell comes first.
 
@@ -173,7 +163,7 @@ def furnish(
     walls, ceiling, plate = room_walls(room, layout.size), layout.size[2], layout.plate_thickness
     holes = [[hole for wall, hole in doorways if wall == number] for number in range(4)]
     middles = [walls[wall].moved((a + b) / 2, 0, 0).origin for wall, (a, b, _, _) in doorways]
-    parts = [_shell(layout, room, holes, with_floor)]
+    parts = [_shell(layout, room, holes)]
     is_flat = [surface.plane is not None for surface in parts[0].surfaces[-len(walls) :]]
     wall_slots = [
         (wall, _CORNER + along)
@@ -214,7 +204,7 @@ def furnish(
         open_wall("door", draw.draw_door)
     for _ in range(layout.num_windows):
         open_wall("window", partial(draw.draw_window, ceiling=ceiling))
-    parts[0] = _shell(layout, room, holes, with_floor)
+    parts[0] = _shell(layout, room, holes)
     on_walls: list[tuple[int, Callable[[np.random.Generator, Frame, float], Part]]] = [
         (layout.num_cabinets, draw.draw_cabinet),
         (layout.num_shelves, partial(draw.draw_shelf, thickness=plate)),
@@ -236,9 +226,7 @@ def furnish(
     return tuple(parts)
 
 
-def _shell(
-    layout: RoomLayout, room: Frame, holes: Sequence[Sequence[Hole]], with_floor: bool
-) -> Part:
+def _shell(layout: RoomLayout, room: Frame, holes: Sequence[Sequence[Hole]]) -> Part:
     """Return floor, ceiling and four walls with their holes as one part."""
     length, width, height = layout.size
     above = room.placed((0, width, height), (1, 0, 0), (0, -1, 0))
@@ -248,9 +236,7 @@ def _shell(
         for number, wall in enumerate(room_walls(room, layout.size))
     ]
     surfaces = (surface for wall in walls for surface in wall.surfaces)
-    return Part(
-        (*ends[not with_floor :], *surfaces), tuple(body for wall in walls for body in wall.solids)
-    )
+    return Part((*ends, *surfaces), tuple(body for wall in walls for body in wall.solids))
 
 
 def _is_away(position: Frame, middles: Sequence[Doubles], distance: float) -> bool:
@@ -297,27 +283,3 @@ def _has_coplanar_face(part: Part, others: Sequence[Part], min_gap: float) -> bo
     parallel = np.abs(np.vecdot(normals[:, None], planes)) > _PARALLEL
     near = np.abs(np.vecdot(middles[:, None], planes) - offsets) < min_gap
     return bool((parallel & near).any())
-
-
-def scanner_positions(
-    layout: RoomLayout, room: Frame, parts: Sequence[Part], rng: np.random.Generator
-) -> Doubles:
-    """Return scanner positions, spread along a room, shape ``(num_viewpoints, 3)``.
-
-    Raises:
-        ConfigError: If there is no free space.
-    """
-    length, width, _ = layout.size
-    positions: list[Doubles] = []
-    for number, clearance in product(range(layout.num_viewpoints), _CLEARANCES):
-        for _ in range(_POSITION_TRIES if len(positions) == number else 0):
-            x = (number + between(rng, 0.25, 0.75)) / layout.num_viewpoints * length
-            y = between(rng, 0.25, 0.75) * width
-            position = room.moved(x, y, between(rng, 1.4, 1.7)).origin
-            near = position + clearance * (2 * rng.random((64, 3)) - 1)
-            if not is_occupied(parts, near).any():
-                positions.append(position)
-                break
-    if len(positions) < layout.num_viewpoints:
-        raise ConfigError("build_room: expected free space for a scanner, got none; enlarge it.")
-    return np.stack(positions)

@@ -68,11 +68,9 @@ class SceneModel:
 
     Args:
         parts: The objects; their surfaces, in order, are the faces.
-        viewpoints: Scanner positions in free space, shape ``(V, 3)``, at least one.
     """
 
     parts: tuple[Part, ...]
-    viewpoints: Doubles
 
     @cached_property
     def surfaces(self) -> tuple[Surface, ...]:

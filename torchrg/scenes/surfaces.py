@@ -100,13 +100,9 @@ class Flat(Surface):
 
     def _draw(self, rng: np.random.Generator, count: int) -> Doubles:
         counts = rng.multinomial(count, self._cell_areas / self._cell_areas.sum())
-        first, second = self._edge_fractions(*rng.random((2, count)))
+        first, second = rng.random((2, count))
         corner, edge, other = self.cells[np.repeat(np.arange(len(counts)), counts)].swapaxes(0, 1)
         return append_zero(corner + (first[:, None] * edge + second[:, None] * other))
-
-    def _edge_fractions(self, first: Doubles, second: Doubles) -> tuple[Doubles, Doubles]:
-        """Map random numbers to the fractions of both edges of a cell."""
-        return first, second
 
 
 def append_zero(positions: Doubles) -> Doubles:
@@ -120,10 +116,6 @@ def rectangle(
     """Return a rectangle from the origin of a frame along its first two axes, with holes.
 
     The third axis is the outward normal; the holes are disjoint.
-
-    Example:
-        >>> rectangle("wall", Frame.upright(np.zeros(3)), 4, 3, holes=[(1, 2, 1, 2)]).area
-        11.0
     """
     xs = np.unique([0, width, *(edge for hole in holes for edge in hole[:2])])
     ys = np.unique([0, height, *(edge for hole in holes for edge in hole[2:])])
@@ -138,22 +130,15 @@ def rectangle(
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """An occluding solid: a box, a cylinder or a ball.
+    """An occluding box.
 
     Args:
         frame: Local coordinate frame at the center.
         size: Lengths along the three axes.
-        num_round: Number of round axes: 0 (box), 2 (cylinder, the first two) or 3 (ball).
-
-    Example:
-        >>> drum = Solid(Frame.upright(np.zeros(3)), (2, 2, 1), num_round=2)
-        >>> drum.contains(np.array([[0.7, 0.7, 0.5], [0.8, 0.8, 0.5]])).tolist()
-        [True, False]
     """
 
     frame: Frame
     size: Triple
-    num_round: int = 0
 
     @cached_property
     def bounds(self) -> Doubles:
@@ -163,7 +148,5 @@ class Solid:
 
     def contains(self, points: Doubles) -> NDArray[np.bool_]:
         """Return the mask of points of shape ``(N, 3)`` inside or on the solid."""
-        fractions = 2 * np.abs(self.frame.to_local(points)) / self.size
-        curved, straight = fractions[:, : self.num_round], fractions[:, self.num_round :]
-        inside: NDArray[np.bool_] = np.vecdot(curved, curved) <= 1
-        return inside & (straight <= 1).all(axis=1)
+        inside: NDArray[np.bool_] = 2 * np.abs(self.frame.to_local(points)) / self.size <= 1
+        return inside.all(axis=1)
