@@ -2,7 +2,7 @@
 
 import pytest
 
-from torchrg._synonyms import advice_on, nearest_name
+from torchrg._synonyms import advice_on, describe_missing, nearest_name
 
 NAMES = ["out", "up", "voxel", "threads", "normals.k", "growing.min_size", "partition.min_size"]
 
@@ -40,3 +40,10 @@ def test_words_without_a_name_have_advice():
     assert "2>/dev/null" in advice_on("quiet")
     assert advice_on("growing.distance_threshold") == advice_on("distance_threshold")
     assert advice_on("shade") == ""
+
+
+def test_missing_attributes_name_what_to_use():
+    found = describe_missing("Plane", "polygons", {"kind": "kind", "polygon": "outline"})
+    assert found == "Plane has no attribute 'polygons'; use outline."
+    found = describe_missing("Cloud", "save", {})
+    assert found == "Cloud has no attribute 'save'; use torchrg.write_cloud(path, cloud, seg)."

@@ -118,12 +118,6 @@ def describe_missing(owner: str, name: str, known: Mapping[str, str]) -> str:
     """Return the message about an attribute that ``owner`` lacks, with what to use.
 
     ``known`` has the attributes by name, in the form in which they are used.
-
-    Example:
-        >>> describe_missing("Plane", "polygons", {"kind": "kind", "polygon": "outline"})
-        "Plane has no attribute 'polygons'; use outline."
-        >>> describe_missing("Cloud", "save", {})
-        "Cloud has no attribute 'save'; use torchrg.write_cloud(path, cloud, seg)."
     """
     word = _squeezed(name)
     use = [known[name]] if name in known else []

@@ -16,8 +16,6 @@ from torchrg.metrics import (
     PartitionScore,
     score_labels,
 )
-from torchrg.metrics.contingency import contingency_table
-from torchrg.metrics.labels import paired_precision_recall
 
 SHARES = [name for name, index in METRICS["labels"].items() if index.unit != "count"]
 
@@ -146,6 +144,6 @@ def test_labels_that_do_not_fit_are_refused():
         score_labels(whole, whole, min_size=0)
 
 
-def test_paired_precision_recall_by_example():
-    table = contingency_table(torch.tensor([4, 4, 4, 5]), torch.tensor([0, 0, 1, 1]))
-    assert paired_precision_recall(table) == (83.33333333333334, 75.0, 2)
+def test_precision_and_recall_of_pairs_by_example():
+    score = score_labels(torch.tensor([4, 4, 4, 5]), torch.tensor([0, 0, 1, 1]))
+    assert (score.precision, score.recall, score.pairs) == (83.33333333333334, 75.0, 2)

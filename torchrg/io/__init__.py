@@ -19,7 +19,6 @@ from torchrg.io.files import ARCHIVE_ERRORS, check_file, check_writable, local_p
 from torchrg.io.las import check_las, count_las, read_las, write_las
 from torchrg.io.npy import count_npy, count_npz, read_npy, read_npz, write_npy, write_npz
 from torchrg.io.pcd import count_pcd, read_pcd, write_pcd
-from torchrg.io.plane_table import planes_to_arrays
 from torchrg.io.ply import count_ply, read_ply, write_ply
 from torchrg.io.text import count_text, read_text, write_text
 from torchrg.io.vg import write_vg
@@ -141,12 +140,7 @@ def read_cloud(path: FilePath, *, columns: Sequence[str] | None = None) -> Cloud
 
 
 def takes_columns(path: FilePath) -> bool:
-    """Whether the format of a file allows column names to be passed.
-
-    Example:
-        >>> takes_columns("scan.txt"), takes_columns("scan.ply")
-        (True, False)
-    """
+    """Whether the format of a file allows column names to be passed."""
     fmt = FORMATS.get(Path(path).suffix.lower())
     return fmt is not None and fmt.takes_columns
 
@@ -214,8 +208,7 @@ def write_cloud(
                 f"{target}: expected {what} of {len(cloud)} points, got {len(result.labels)}; "
                 "pass the cloud that was segmented."
             )
-    suffix = target.suffix.lower()
-    if suffix == ".npz":
+    if target.suffix.lower() == ".npz":
         write_npz(target, cloud, segmentation, provenance, superpoints)
         return
     fields = cloud.fields
@@ -224,13 +217,7 @@ def write_cloud(
     if segmentation is not None:
         results = {name: getattr(segmentation, name).numpy(force=True) for name in RESULT_FIELDS}
         fields = add_result_fields(fields, results)
-    labeled = replace(cloud, fields=fields)
-    if suffix == _PLANES_SUFFIX and segmentation is not None:
-        table = planes_to_arrays(segmentation.planes, cloud.origin)
-        equations = np.column_stack([table["plane_normal"], -table["plane_offset"]])
-        write_vg(target, labeled, equations)
-        return
-    _get_writer(target)(target, labeled)
+    _get_writer(target)(target, replace(cloud, fields=fields))
 
 
 def check_output(path: FilePath, cloud: Cloud | None = None) -> None:

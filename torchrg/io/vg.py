@@ -14,8 +14,8 @@ from torchrg.structures import UNLABELED, Cloud
 from torchrg.structures.colors import read_colors
 
 
-def write_vg(path: Path, cloud: Cloud, planes: NDArray[np.floating] | None = None) -> None:
-    """Write a text file; ``planes`` ``(M, 4)`` are indexed by label, or fitted if None."""
+def write_vg(path: Path, cloud: Cloud) -> None:
+    """Write a text file with a group for each label, and its least-squares plane."""
     number = "%.9g" if cloud.coordinates.dtype == np.float32 else "%.17g"
     colors, _ = read_colors(path, cloud.fields.get("color", np.zeros((0, 3), np.uint8)))
     with atomic_path(path) as temporary, temporary.open("w", encoding="ascii", newline="\n") as out:
@@ -26,29 +26,17 @@ def write_vg(path: Path, cloud: Cloud, planes: NDArray[np.floating] | None = Non
         ):
             out.write(f"num_{key}: {len(rows)}\n")
             np.savetxt(out, rows, fmt=fmt)
-        groups = _find_groups(cloud, planes)
-        out.write(f"num_groups: {len(groups)}\n")
-        for index, (plane, rows) in enumerate(groups):
+        labels = cloud.fields.get("labels", np.full(len(cloud), UNLABELED)).astype(np.int64)
+        order = np.argsort(labels, kind="stable")[np.count_nonzero(labels < 0) :]
+        _, sizes = np.unique(labels[order], return_counts=True)
+        out.write(f"num_groups: {len(sizes)}\n")
+        for index, rows in enumerate(np.split(order, np.cumsum(sizes))[:-1]):
             out.write("group_type: 0\nnum_group_parameters: 4\n")  # Type 0 is a plane.
+            plane = _fit_plane(cloud.coordinates[rows])
             out.write(f"group_parameters: {' '.join(f'{value:.17g}' for value in plane)}\n")
             out.write(f"group_label: plane_{index}\ngroup_color: {_group_color(index)}\n")
             out.write(f"group_num_point: {len(rows)}\n{' '.join(map(str, rows))}\n")
             out.write("num_children: 0\n")
-
-
-def _find_groups(
-    cloud: Cloud, planes: NDArray[np.floating] | None
-) -> list[tuple[NDArray[np.floating], NDArray[np.integer]]]:
-    """Return the plane and the point indices of each label, labels ascending."""
-    labels = cloud.fields.get("labels", np.full(len(cloud), UNLABELED)).astype(np.int64)
-    order = np.argsort(labels, kind="stable")
-    order = order[labels[order] >= 0]
-    names, starts = np.unique(labels[order], return_index=True)
-    parts = np.split(order, starts[1:]) if len(names) else []
-    return [
-        (_fit_plane(cloud.coordinates[rows]) if planes is None else planes[name], rows)
-        for name, rows in zip(names, parts, strict=True)
-    ]
 
 
 def _fit_plane(points: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -55,49 +55,33 @@ class Index(NamedTuple):
     higher_is_better: bool | None
 
 
-_LABELS = {
+_MEANINGS = {
     Index("%", True): "precision recall f1",
-    Index("count", None): "pairs regions faces points",
-    Index(
-        "fraction", True
-    ): "mean_best_iou precision_iou50 recall_iou50 precision_iou80 recall_iou80 "
-    "fraction_labeled covering ari",
-}
-_SUPERPOINTS = {
-    Index("fraction", True): "asa oracle_miou boundary_recall boundary_precision",
-    Index("", None): "boundary_distance",
-    Index("count", None): "count points_per_superpoint points",
-}
-_CLUSTERS = {
+    Index("fraction", True): "mean_best_iou precision_iou50 recall_iou50 precision_iou80 "
+    "recall_iou80 fraction_labeled covering ari asa oracle_miou boundary_recall boundary_precision "
+    "under_5_deg under_10_deg under_20_deg",
     Index("rad", False): "cp",
     Index("rad", True): "sp",
-    Index("", False): "dbi",
-    Index("", True): "dvi",
-    Index("count", None): "clusters points sampled_clusters",
-    Index("count", False): "invalid",
-    Index("", None): "dvi_exact",
-}
-_NORMALS = {
-    Index("deg^2", False): "msae",
     Index("deg", False): "rms mean median",
-    Index("fraction", True): "under_5_deg under_10_deg under_20_deg",
-    Index("count", None): "points",
+    Index("deg^2", False): "msae",
+    Index("", True): "dvi",
+    Index("", False): "dbi",
+    Index("", None): "boundary_distance dvi_exact",
     Index("count", False): "invalid",
+    Index("count", None): "pairs regions faces points count points_per_superpoint clusters "
+    "sampled_clusters",
 }
-
-
-def _by_name(fields: tuple[str, ...], meanings: dict[Index, str]) -> Mapping[str, Index]:
-    """Return the unit and direction of each field."""
-    index_of = {name: index for index, names in meanings.items() for name in names.split()}
-    return MappingProxyType({name: index_of[name] for name in fields})
-
-
+_INDEX_OF = {name: index for index, names in _MEANINGS.items() for name in names.split()}
+_FIELDS = {
+    "labels": LabelScore._fields,
+    "superpoints": PartitionScore._fields,
+    "clusters": ClusterScore._fields,
+    "normals": NormalScore._fields,
+}
 METRICS: Mapping[str, Mapping[str, Index]] = MappingProxyType(
     {
-        "labels": _by_name(LabelScore._fields, _LABELS),
-        "superpoints": _by_name(PartitionScore._fields, _SUPERPOINTS),
-        "clusters": _by_name(ClusterScore._fields, _CLUSTERS),
-        "normals": _by_name(NormalScore._fields, _NORMALS),
+        part: MappingProxyType({name: _INDEX_OF[name] for name in fields})
+        for part, fields in _FIELDS.items()
     }
 )
 """Fields of the scores by part and name.

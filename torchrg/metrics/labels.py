@@ -83,13 +83,21 @@ def score_labels(
     """
     table = count_overlaps("score_labels", labels, ground_truth, min_size, ignore)
     num_regions, num_faces = len(table.region_sizes), len(table.face_sizes)
-    precision, recall, num_pairs = paired_precision_recall(table)
+    pairs = match_regions(table)
+    shared = 100 * table.overlaps[pairs].double()
+    precision, recall = (
+        fraction(float((shared / sizes).sum()), len(pairs))
+        for sizes in (
+            table.region_sizes[table.regions[pairs]],
+            table.face_sizes[table.faces[pairs]],
+        )
+    )
     matched50, matched80 = (int((table.iou > bound).sum()) for bound in (0.5, 0.8))
     return LabelScore(
         precision=precision,
         recall=recall,
         f1=fraction(2 * precision * recall, precision + recall),
-        pairs=num_pairs,
+        pairs=len(pairs),
         regions=num_regions,
         faces=num_faces,
         points=table.num_points,
@@ -102,20 +110,6 @@ def score_labels(
         covering=segmentation_covering(table),
         ari=adjusted_rand_index(table),
     )
-
-
-def paired_precision_recall(table: ContingencyTable) -> tuple[float, float, int]:
-    """Return mean precision and recall of the pairs, in percent, and the number of pairs.
-
-    ``P = 100 |C & G| / |C|`` and ``R = 100 |C & G| / |G|`` for each pair of :func:`match_regions`;
-    0 without pairs.
-    """
-    pairs = match_regions(table)
-    shared = 100 * table.overlaps[pairs].double()
-    precision = shared / table.region_sizes[table.regions[pairs]]
-    recall = shared / table.face_sizes[table.faces[pairs]]
-    count = len(pairs)
-    return fraction(float(precision.sum()), count), fraction(float(recall.sum()), count), count
 
 
 def match_regions(table: ContingencyTable) -> Tensor:

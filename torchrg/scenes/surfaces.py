@@ -148,5 +148,5 @@ class Solid:
 
     def contains(self, points: Doubles) -> NDArray[np.bool_]:
         """Return the mask of points of shape ``(N, 3)`` inside or on the solid."""
-        inside: NDArray[np.bool_] = 2 * np.abs(self.frame.to_local(points)) / self.size <= 1
-        return inside.all(axis=1)
+        farthest: Doubles = (2 * np.abs(self.frame.to_local(points)) / self.size).max(axis=1)
+        return farthest <= 1
