@@ -384,3 +384,9 @@ def test_settings_are_shown_as_the_call_that_makes_them(config):
 
 def test_settings_of_by_example():
     assert settings_of("f", NormalsConfig, "classic", {"k": 30}).method == "pca"
+
+
+def test_settings_that_keep_all_planes_have_the_up_axis_of_classes():
+    assert load_config(kinds="wall").without_selection().planes.up == "z"
+    assert load_config().without_selection().planes.up is None
+    assert load_config("classic").measured(None) == {}

@@ -395,12 +395,7 @@ class PipelineConfig(SelectionConfig):
         return max(self.normals.k, self.normals.adaptive_k or 0)
 
     def without_selection(self) -> "PipelineConfig":
-        """Return settings that keep all planes, with an up axis if ``kinds`` requires classes.
-
-        Example:
-            >>> load_config(kinds="wall").without_selection().planes.up
-            'z'
-        """
+        """Return settings that keep all planes, with an up axis if ``kinds`` requires classes."""
         up = "z" if self.planes.up is None and self.kinds is not None else self.planes.up
         planes = dataclasses.replace(self.planes, up=up)
         return dataclasses.replace(self, min_area=0.0, kinds=None, sort="points", planes=planes)
@@ -456,12 +451,7 @@ class PipelineConfig(SelectionConfig):
         )
 
     def measured(self, sampling: Sampling | None) -> dict[str, Any]:
-        """Return the measured sampling and the settings chosen from it, as JSON values.
-
-        Example:
-            >>> load_config("classic").measured(None)
-            {}
-        """
+        """Return the measured sampling and the settings chosen from it, as JSON values."""
         if sampling is None:
             return {}
         chosen = self.with_sampling(sampling)

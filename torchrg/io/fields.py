@@ -23,18 +23,14 @@ from torchrg.structures.points import Array, are_integers
 
 NamedColumns = Mapping[str, Array]
 """Per-point values by name, each of shape ``(N, ...)``."""
-FIELD_NAMES = {
-    "label": "labels",
-    "labels": "labels",
-    "normal": "normals",
-    "normals": "normals",
-    "color": "color",
-    "colors": "color",
-    "rgb": "color",
-    "intensity": "intensity",
-    "intensities": "intensity",
+_WORDS = {
+    "labels": "label labels",
+    "normals": "normal normals",
+    "color": "color colors rgb",
+    "intensity": "intensity intensities",
     "curvature": "curvature",
 }
+FIELD_NAMES = {word: name for name, words in _WORDS.items() for word in words.split()}
 """Field names by lower-case column name."""
 _TRIPLES = {
     ("nx", "ny", "nz"): "normals",

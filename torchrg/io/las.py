@@ -76,7 +76,7 @@ def read_las(path: Path, size: int) -> Cloud:
     The cloud is float64, with every extra dimension and every standard dimension that is not all
     zero; colors are uint8 if 8 bits are enough, else uint16. The header is kept for writing.
     """
-    laspy = _import_laspy("read")
+    laspy = require("laspy", extra="las", purpose="read LAS and LAZ files")
     _check_header(path, size)
     with _open_reader(laspy, path) as reader:
         header = reader.header
@@ -161,7 +161,7 @@ def _open_reader(laspy: ModuleType, path: Path) -> Iterator[Any]:
 
 def check_las(path: Path, cloud: Cloud | None) -> None:
     """Check that laspy is installed, and that the points of a known cloud are finite."""
-    _import_laspy("write")
+    require("laspy", extra="las", purpose="write LAS and LAZ files")
     non_finite = np.flatnonzero([] if cloud is None else ~cloud.finite)
     if len(non_finite):
         raise FormatError(
@@ -176,7 +176,7 @@ def write_las(path: Path, cloud: Cloud) -> None:
     Scale, offset, reference system and point format of a LAS input are kept. Otherwise the scale is
     the smallest power of ten for which the coordinates fit 32 bits.
     """
-    laspy = _import_laspy("write")
+    laspy = require("laspy", extra="las", purpose="write LAS and LAZ files")
     columns = flatten_cloud(path, cloud, _FIELD_NAMES)
     has_date = "las" in cloud.header and cloud.header["las"].creation_date is not None
     header = _header(laspy, cloud, colored=all(name in columns for name in _FIELD_NAMES.color))
@@ -344,11 +344,6 @@ def count_las(path: Path, size: int) -> int:
     if head[_VERSION_AT] >= 4:
         (count,) = struct.unpack_from("<Q", head, _COUNT14_AT)
     return int(count)
-
-
-def _import_laspy(verb: str) -> ModuleType:
-    """Import laspy."""
-    return require("laspy", extra="las", purpose=f"{verb} LAS and LAZ files")
 
 
 def _check_header(path: Path, size: int) -> None:

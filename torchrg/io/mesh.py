@@ -58,7 +58,8 @@ def find_fronts(
         for start in range(0, len(corners) if corners.shape[1] > 2 else 0, at_once):
             part = corners[start : start + at_once]
             part = part[finite[part].all(axis=1)]
-            normals = _vector_areas(positions, part)
+            edges = positions[part[:, 1:]] - positions[part[:, :1]]
+            normals = np.cross(edges[:, :-1], edges[:, 1:]).sum(axis=1)
             sizes = np.linalg.norm(normals, axis=1)
             for total, values in zip((areas, *sums), (sizes, *normals.T), strict=True):
                 np.add.at(total, part.reshape(-1), np.repeat(values, part.shape[1]))
@@ -66,10 +67,3 @@ def find_fronts(
     is_clear = length > _MIN_AGREEMENT * areas
     fronts = np.where(is_clear, sums / np.where(is_clear, length, 1.0), 0.0)
     return np.ascontiguousarray(fronts.T, dtype=np.float32)
-
-
-def _vector_areas(positions: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the normals of faces, scaled to twice their areas, shape ``(n, 3)``."""
-    edges = positions[faces[:, 1:]] - positions[faces[:, :1]]
-    areas: NDArray[np.float64] = np.cross(edges[:, :-1], edges[:, 1:]).sum(axis=1)
-    return areas

@@ -63,8 +63,6 @@ _MAX_RATIO = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: 1032}
 """Maximum decompressed bytes per archive byte, by supported compression method."""
 _MAX_ARRAYS = 10_000
 """Maximum number of arrays of an archive: to check an array takes a fifth of a millisecond."""
-_MAX_CHECKED = 1 << 30
-"""Maximum total size of skipped arrays that are read to verify their checksums (seconds)."""
 _MAX_HEADER_BYTES = 1 << 16
 """Bytes read to parse an array header, of which NumPy accepts up to 10,000."""
 
@@ -116,11 +114,6 @@ def read_npz(path: Path, size: int) -> Cloud:
         columns = {
             name: _read_member(path, archive, name) for name in per_point if name not in mismatched
         }
-        skipped = [archive.getinfo(f"{name}.npy") for name in layouts if name not in columns]
-        if sum(member.file_size for member in skipped) <= _MAX_CHECKED:
-            for member in skipped:
-                with _open_member(path, archive, member) as stream:
-                    _drain(stream)
     notes: tuple[str, ...] = ()
     if mismatched:
         notes = (f"{', '.join(mismatched)} skipped: not {num_points:,} rows",)

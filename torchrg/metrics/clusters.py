@@ -139,9 +139,10 @@ def score_clusters(
     means, diameters, num_sampled, exact = measure_spreads(
         parts, centers, sample_size=sample_size, seed=seed
     )
+    angles = chord_to_angle(chords_between(turned, centers[clusters]))
     sp, dbi = _separation(centers, means)
     return ClusterScore(
-        cp=_compactness(chords_between(turned, centers[clusters]), clusters),
+        cp=float((torch.bincount(clusters, angles) / torch.bincount(clusters)).mean()),
         sp=sp,
         dbi=dbi,
         dvi=_dunn(closest_between(directions, clusters), diameters),
@@ -162,14 +163,6 @@ def _labeled_directions(
     directions, exists = unit_vectors(normals[labeled])
     _, clusters = number_labels(labels[labeled][exists])
     return directions[exists], clusters, int((~exists).sum())
-
-
-def _compactness(chords: Tensor, clusters: Tensor) -> float:
-    """Return the mean over the clusters of the mean angle to the center (eq. 12)."""
-    if not len(clusters):
-        return math.nan
-    angles = chord_to_angle(chords)
-    return float((torch.bincount(clusters, angles) / torch.bincount(clusters)).mean())
 
 
 def _separation(centers: Tensor, spreads: Tensor) -> tuple[float, float]:

@@ -386,13 +386,7 @@ class Superpoints(_Movable):
         return f"Superpoints({_count_points(self.labels)}, {counts} superpoints)"
 
     def by_level(self) -> dict[str, NDArray[np.int32]]:
-        """Return all partitions by their field names in files.
-
-        Example:
-            >>> one = torch.tensor([0, 0, 1])
-            >>> list(Superpoints(one, torch.tensor([-1, -1]), (one // 2, one // 2)).by_level())
-            ['superpoint', 'superpoint_1', 'superpoint_2']
-        """
+        """Return all partitions by their field names in files."""
         return {
             "superpoint" if i == 0 else f"superpoint_{i}": level.numpy(force=True).astype(np.int32)
             for i, level in enumerate((self.labels, *self.levels))
