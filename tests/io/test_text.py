@@ -318,8 +318,8 @@ def test_written_text_says_what_its_columns_are(tmp_path):
         ),
         (
             "# 3D point list with one line of data per point:\n#   POINT3D_ID, X, Y, Z, R, G, B, "
-            "ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n63 1.6 0.1 0.7 115 121 122 1.33 16 6542\n",
-            "line 2: expected points, got COLMAP's points3D.txt; convert it: colmap model_conv",
+            "ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n63 1.6 0.1 0.7 115 121 122 1.33 16 6 1 5\n",
+            "line 3: expected 10 numbers, got '63 1.6 0.1 0.7 115 121 122 1.33 16 6 1 5'; correct",
         ),
         (
             "x y z label\n0 1 2 0.5\n",

@@ -38,31 +38,29 @@ class Format(NamedTuple):
             without reading points. May raise any error on a corrupt file.
         write: Writes a cloud; None for read-only formats.
         check: Raises if a cloud (None: any cloud) cannot be written; None if every cloud can.
-        takes_columns: Whether the columns may be unnamed.
     """
 
     read: Callable[..., Cloud]
     count: Callable[[Path, int], int]  # type: ignore[assignment]
     write: Callable[[Path, Cloud], None] | None
     check: Callable[[Path, Cloud | None], None] | None = None
-    takes_columns: bool = False
 
 
 RESULT_FIELDS = ("labels", "normals", "curvature")
 """Fields that a segmentation adds to a cloud."""
 FORMATS: dict[str, Format] = {
     ".npz": Format(read_npz, count_npz, write_npz),
-    ".npy": Format(read_npy, count_npy, write_npy, takes_columns=True),
+    ".npy": Format(read_npy, count_npy, write_npy),
     ".ply": Format(read_ply, count_ply, write_ply),
     ".pcd": Format(read_pcd, count_pcd, write_pcd),
     ".las": Format(read_las, count_las, write_las, check_las),
     ".laz": Format(read_las, count_las, write_las, check_las),
     ".e57": Format(read_e57, count_e57, None),
-    ".xyz": Format(read_text, count_text, write_text, takes_columns=True),
-    ".txt": Format(read_text, count_text, write_text, takes_columns=True),
-    ".asc": Format(read_text, count_text, write_text, takes_columns=True),
-    ".pts": Format(read_text, count_text, None, takes_columns=True),
-    ".csv": Format(read_text, count_text, None, takes_columns=True),
+    ".xyz": Format(read_text, count_text, write_text),
+    ".txt": Format(read_text, count_text, write_text),
+    ".asc": Format(read_text, count_text, write_text),
+    ".pts": Format(read_text, count_text, None),
+    ".csv": Format(read_text, count_text, None),
 }
 """Readable formats, by suffix. Writable formats store any field."""
 FOLDER_SUFFIXES = tuple(kind for kind in FORMATS if kind != ".csv")
@@ -124,7 +122,7 @@ def read_cloud(path: FilePath, *, columns: Sequence[str] | None = None) -> Cloud
     """
     source = local_path(path)
     size, fmt = check_file(source), _get_format(source)
-    if columns is not None and not fmt.takes_columns:
+    if columns is not None and not takes_columns(source):
         raise FormatError(f"{source}: column names apply to text and .npy files only; omit them.")
     names = () if columns is None else (columns,)
     try:
@@ -141,8 +139,7 @@ def read_cloud(path: FilePath, *, columns: Sequence[str] | None = None) -> Cloud
 
 def takes_columns(path: FilePath) -> bool:
     """Whether the format of a file allows column names to be passed."""
-    fmt = FORMATS.get(Path(path).suffix.lower())
-    return fmt is not None and fmt.takes_columns
+    return Path(path).suffix.lower() in (*TEXT_SUFFIXES, ".npy")
 
 
 def write_cloud(

@@ -33,15 +33,10 @@ _WORDS = {
 FIELD_NAMES = {word: name for name, words in _WORDS.items() for word in words.split()}
 """Field names by lower-case column name."""
 _TRIPLES = {
-    ("nx", "ny", "nz"): "normals",
-    ("normal_x", "normal_y", "normal_z"): "normals",
-    ("normalx", "normaly", "normalz"): "normals",
-    ("red", "green", "blue"): "color",
-    ("diffuse_red", "diffuse_green", "diffuse_blue"): "color",
-    ("r", "g", "b"): "color",
-    ("rf", "gf", "bf"): "color",
+    "normals": "nx ny nz, normal_x normal_y normal_z, normalx normaly normalz",
+    "color": "red green blue, diffuse_red diffuse_green diffuse_blue, r g b, rf gf bf",
 }
-"""Field names by three lower-case column names."""
+"""Triples of lower-case column names by field name."""
 SKIPPED = "_"
 """Name of a skipped column, as in PCD."""
 _SHOWN_NAMES = 8
@@ -203,11 +198,12 @@ def _field_columns(columns: NamedColumns) -> dict[str, list[str]]:
     """
     by_plain_name = {_normalize_name(name): name for name in columns if columns[name].ndim == 1}
     remaining, fields = dict(columns), dict[str, list[str]]()
-    for parts, target in _TRIPLES.items():
-        if target not in fields and all(column in by_plain_name for column in parts):
-            fields[target] = [by_plain_name[column] for column in parts]
-            for column in fields[target]:
-                del remaining[column]
+    for target, triples in _TRIPLES.items():
+        for parts in map(str.split, triples.split(",")):
+            if target not in fields and all(column in by_plain_name for column in parts):
+                fields[target] = [by_plain_name[column] for column in parts]
+                for column in fields[target]:
+                    del remaining[column]
     for name, members in _find_numbered(remaining).items():
         if name not in fields and name not in remaining:
             fields[name] = members

@@ -85,7 +85,12 @@ def read_las(path: Path, size: int) -> Cloud:
         for dimension in header.point_format.extra_dimensions:
             if dimension.is_scaled:
                 check_grid(path, dimension.name, dimension.scales, dimension.offsets)
-        _check_points(path, header, size)
+        start, is_laz = header.offset_to_point_data, header.are_points_compressed
+        min_bytes = 0 if is_laz else header.point_count * header.point_format.size
+        content = f"{header.point_count:,} points"
+        check_available(path, start, min_bytes, content, available=size - start)
+        if is_laz:
+            _check_chunks(path, header, size)
         # Reading in chunks bounds the memory by the stored points, whatever the header claims.
         parts = list(map(_chunk_columns, reader.chunk_iterator(_POINTS_PER_CHUNK)))
     # Compression does not matter for the cloud, and laspy cannot write an octree.
@@ -366,15 +371,6 @@ def _check_header(path: Path, size: int) -> None:
             start += 60
             check_available(path, start, length, content, available=size - start)
             start += length
-
-
-def _check_points(path: Path, header: Any, size: int) -> None:  # noqa: ANN401
-    """Check that the points fit into the file."""
-    start, content = header.offset_to_point_data, f"{header.point_count:,} points"
-    min_bytes = 0 if header.are_points_compressed else header.point_count * header.point_format.size
-    check_available(path, start, min_bytes, content, available=size - start)
-    if header.are_points_compressed:
-        _check_chunks(path, header, size)
 
 
 def _check_chunks(path: Path, header: Any, size: int) -> None:  # noqa: ANN401

@@ -63,6 +63,7 @@ _MAX_RATIO = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: 1032}
 """Maximum decompressed bytes per archive byte, by supported compression method."""
 _MAX_ARRAYS = 10_000
 """Maximum number of arrays of an archive: to check an array takes a fifth of a millisecond."""
+_REPAIR = "; copy or write it again"
 _MAX_HEADER_BYTES = 1 << 16
 """Bytes read to parse an array header, of which NumPy accepts up to 10,000."""
 
@@ -248,23 +249,10 @@ def _open_archive(path: Path) -> Iterator[zipfile.ZipFile]:
     """Open an archive, and convert errors to errors that name it."""
     message = f"{path}: expected an archive of NumPy arrays, got: "
     with (
-        wrap_errors(message, *ARCHIVE_ERRORS, repair="; copy or write it again"),
+        wrap_errors(message, *ARCHIVE_ERRORS, repair=_REPAIR),
         zipfile.ZipFile(path) as archive,
     ):
         yield archive
-
-
-@contextmanager
-def _open_member(
-    path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo
-) -> Iterator[IO[bytes]]:
-    """Open an archive member, and convert errors to errors that name both."""
-    message = f"{path}: {member.filename!r}: "
-    with (
-        wrap_errors(message, *ARCHIVE_ERRORS, repair="; copy or write the file again"),
-        archive.open(member) as stream,
-    ):
-        yield stream
 
 
 def _check_members(path: Path, archive: zipfile.ZipFile, size: int) -> dict[str, _Layout]:
@@ -288,24 +276,26 @@ def _check_members(path: Path, archive: zipfile.ZipFile, size: int) -> dict[str,
         content = repr(member.filename)
         max_bytes = min(member.compress_size, size) * _MAX_RATIO[member.compress_type]
         check_available(path, member.header_offset, member.file_size, content, available=max_bytes)
-        with _open_member(path, archive, member) as stream:
+        with (
+            wrap_errors(f"{path}: {content}: ", *ARCHIVE_ERRORS, repair=_REPAIR),
+            archive.open(member) as stream,
+        ):
             name = member.filename.removesuffix(".npy")
             layouts[name] = _check_array(path, stream, member.file_size, content)
     return layouts
 
 
 def _read_member(path: Path, archive: zipfile.ZipFile, name: str) -> Array:
-    """Read an archive member to its end."""
-    with _open_member(path, archive, archive.getinfo(f"{name}.npy")) as stream:
+    """Read an archive member to its end, which verifies its checksum."""
+    member = f"{name}.npy"
+    with (
+        wrap_errors(f"{path}: {member!r}: ", *ARCHIVE_ERRORS, repair=_REPAIR),
+        archive.open(member) as stream,
+    ):
         values: Array = npy_format.read_array(stream, allow_pickle=False)
-        _drain(stream)
+        while stream.read(BYTES_PER_READ):
+            pass
         return scratch.store(values)
-
-
-def _drain(stream: IO[bytes]) -> None:
-    """Read a member to its end, which verifies its checksum, and discard the data."""
-    while stream.read(BYTES_PER_READ):
-        pass
 
 
 def _check_npy(path: Path, size: int) -> _Layout:

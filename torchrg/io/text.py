@@ -39,8 +39,6 @@ _COMMENTS = ("#", "//", "BEGIN", "END")
 """Beginnings of lines without points. Words alone separate the scans of a file."""
 _WINDOWS_NAN = re.compile(r"1[.,]#[A-Z]+[0-9]*|nan\([a-z]*\)", re.IGNORECASE)
 """Numbers that are not finite, as Windows prints them: ``-1.#IND``, ``1.#QNAN0``, ``-nan(ind)``."""
-_COLMAP = "POINT3D_ID, X, Y, Z"
-"""Comment above the points in COLMAP's ``points3D.txt``, whose rows list images."""
 
 
 class _Dialect(NamedTuple):
@@ -276,12 +274,6 @@ def _read_preamble(path: Path, lines: Iterable[str], columns: Sequence[str] | No
         dialect = _detect_dialect(bare)
         words = dialect.split(bare)
         are_numbers = [_is_number(word) for word in words]
-        if is_comment and _COLMAP in text:
-            raise FormatError(
-                f"{path}: line {number}: expected points, got COLMAP's points3D.txt; convert it: "
-                f"colmap model_converter --input_path {path.parent} --output_path points.ply "
-                "--output_type PLY."
-            )
         if is_comment:
             header, comment = (bare, "") if _parse_names(bare) else (header, bare)
         elif not bare.strip():
