@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -248,13 +248,23 @@ def _add_dimensions(
     column that does not fit the standard dimension of its name becomes an extra dimension.
     """
     dimensions, params = dict[str, Array](), list[Any]()
-    for extra in _input_dimensions(cloud.header.get("las"), columns):
-        if extra.holds(columns):
-            d = extra.dimension
-            parameters = (d.name, d.dtype, d.description, d.offsets, d.scales, d.no_data)
+    stored = cloud.header.get("las")
+    extras = [] if stored is None else [*stored.point_format.extra_dimensions]
+    free = columns.keys() - {d.name for d in extras}
+    for d in extras:
+        # A renamed field that a result replaces keeps its dimension, under the new name.
+        backups = {name: _BACKUP_NAMES.get(name, f"{name}_input") for name in _column_names(d)}
+        names = [backup if backup in free else name for name, backup in backups.items()]
+        if not columns.keys() >= {*names}:
+            continue
+        parts, is_single = [columns[name] for name in names], len(names) == 1
+        values = parts[0] if is_single else np.stack(parts, axis=1)
+        name = names[0] if is_single else d.name
+        if _extra_holds(d, values):
+            parameters = (name, d.dtype, d.description, d.offsets, d.scales, d.no_data)
             params.append(laspy.ExtraBytesParams(*parameters))
-            dimensions[d.name] = extra.join(columns)
-            columns = {name: c for name, c in columns.items() if name not in extra.columns}
+            dimensions[name] = values
+            columns = {name: c for name, c in columns.items() if name not in names}
     standard = set(header.point_format.dimension_names)
     for name, column in columns.items():
         if name in ("x", "y", "z"):
@@ -278,52 +288,16 @@ def _add_dimensions(
     return dimensions
 
 
-class _InputDimension(NamedTuple):
-    """Extra dimension of the input.
-
-    Attributes:
-        dimension: laspy's description, with the name to write.
-        columns: NamedColumns of the cloud that are its elements.
-    """
-
-    dimension: Any
-    columns: tuple[str, ...]
-
-    def holds(self, columns: NamedColumns) -> bool:
-        """Whether the type and scale of the dimension represent its columns exactly."""
-        values, dimension = self.join(columns), self.dimension
-        dtype = dimension.dtype.base
-        if dimension.is_scaled:
-            steps = np.rint((values - dimension.offsets) / dimension.scales)
-            if not np.isfinite(steps).all():
-                return False
-            back = steps * dimension.scales + dimension.offsets
-            return _fits(steps, dtype) and bool((back == values).all())
+def _extra_holds(dimension: Any, values: Array) -> bool:  # noqa: ANN401
+    """Whether the type and scale of an extra dimension represent all values exactly."""
+    dtype = dimension.dtype.base
+    if not dimension.is_scaled:
         return _fits(values, dtype)
-
-    def join(self, columns: NamedColumns) -> Array:
-        """Return the values of the dimension, shape ``(N,)`` or ``(N, K)``."""
-        parts = [columns[name] for name in self.columns]
-        return parts[0] if len(parts) == 1 else np.stack(parts, axis=1)
-
-
-def _input_dimensions(header: Any, columns: NamedColumns) -> list[_InputDimension]:  # noqa: ANN401
-    """Return the extra dimensions of the input whose columns the cloud still has.
-
-    A renamed field that a result replaces keeps its dimension, under the new name.
-    """
-    extras = list[_InputDimension]()
-    dimensions = [] if header is None else [*header.point_format.extra_dimensions]
-    names = {dimension.name for dimension in dimensions}
-    for dimension in dimensions:
-        parts = list[str]()
-        for column in _column_names(dimension):
-            backup = _BACKUP_NAMES.get(column, f"{column}_input")
-            parts.append(backup if backup in columns and backup not in names else column)
-        if all(column in columns for column in parts):
-            name = parts[0] if len(parts) == 1 else dimension.name
-            extras.append(_InputDimension(dimension._replace(name=name), tuple(parts)))
-    return extras
+    steps = np.rint((values - dimension.offsets) / dimension.scales)
+    if not np.isfinite(steps).all():
+        return False
+    back = steps * dimension.scales + dimension.offsets
+    return _fits(steps, dtype) and bool((back == values).all())
 
 
 def _column_names(dimension: Any) -> list[str]:  # noqa: ANN401
