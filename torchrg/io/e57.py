@@ -329,14 +329,15 @@ def _read_points(path: Path, pye57: ModuleType, file: Any, header: Any) -> tuple
     libe57, count = pye57.libe57, header.point_count
     prototype = libe57.StructureNode(header.points.prototype())
     nodes = {name: pye57.utils.get_node(prototype, name) for name in header.point_fields}
+    block = _Block()
     for name, node in nodes.items():
         if name in (*_AXES, *_SPHERICAL) and isinstance(node, libe57.ScaledIntegerNode):
             check_grid(path, name, [node.scale()], [node.offset()])
-    block = {
-        name: scratch.empty((count,), np.dtype(_type_code(libe57, node)))
-        for name, node in nodes.items()
-        if not isinstance(node, libe57.StringNode)
-    }
+        if not isinstance(node, libe57.StringNode):
+            is_single = isinstance(node, libe57.FloatNode) and node.precision() == libe57.E57_SINGLE
+            # libe57 has a single code for 64-bit integers.
+            code = "q" if isinstance(node, libe57.IntegerNode) else "f" if is_single else "d"
+            block[name] = scratch.empty((count,), np.dtype(code))
     if count:
         buffers = libe57.VectorSourceDestBuffer()
         for name, column in block.items():
@@ -360,14 +361,6 @@ def _read_points(path: Path, pye57: ModuleType, file: Any, header: Any) -> tuple
         if name in block:
             points[block.pop(name) != 0] = np.nan
     return points, block
-
-
-def _type_code(libe57: Any, node: Any) -> str:  # noqa: ANN401
-    """Return the NumPy type code of a field; ``q`` is libe57's only 64-bit integer code."""
-    if isinstance(node, libe57.IntegerNode):
-        return "q"
-    single = isinstance(node, libe57.FloatNode) and node.precision() == libe57.E57_SINGLE
-    return "f" if single else "d"
 
 
 def _to_world(points: Array, block: _Block, scan: ScanPose) -> _Block:

@@ -196,7 +196,8 @@ def _field_columns(columns: NamedColumns) -> dict[str, list[str]]:
 
     Triples and numbered columns are joined, the others renamed, by shape and type only.
     """
-    by_plain_name = {_normalize_name(name): name for name in columns if columns[name].ndim == 1}
+    single = [name for name in columns if columns[name].ndim == 1]
+    by_plain_name = {name.lower().removeprefix("scalar_"): name for name in single}
     remaining, fields = dict(columns), dict[str, list[str]]()
     for target, triples in _TRIPLES.items():
         for parts in map(str.split, triples.split(",")):
@@ -216,18 +217,14 @@ def _field_columns(columns: NamedColumns) -> dict[str, list[str]]:
 
 def _unique_field_name(name: str, values: Array, existing: Collection[str]) -> str:
     """Return the field name of a column if its shape fits, changed if the name is taken."""
-    target = FIELD_NAMES.get(_normalize_name(name), name.removeprefix("scalar_") or name)
+    plain = name.lower().removeprefix("scalar_")
+    target = FIELD_NAMES.get(plain, name.removeprefix("scalar_") or name)
     shapes = {"normals": (3,), "color": (3,), "labels": ()}
     if target in shapes and values.shape[1:] != shapes[target]:
         target = name
     while target in existing:
         target = name = f"_{name}" if target == name else name
     return target
-
-
-def _normalize_name(name: str) -> str:
-    """Return a lower-case name without CloudCompare's prefix."""
-    return name.lower().removeprefix("scalar_")
 
 
 def _find_numbered(columns: NamedColumns) -> dict[str, list[str]]:

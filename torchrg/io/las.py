@@ -284,7 +284,11 @@ def _add_dimensions(
             params.append(laspy.ExtraBytesParams(name, column.dtype.str[1:], description))
         dimensions[name] = column
     header.add_extra_dims(params)
-    _clear_ranges(header)
+    # laspy 2.7.0 sets ranges from the first value; the options of undocumented bytes are a number.
+    for record in header.vlrs.get("ExtraBytesVlr"):
+        for structure in record.extra_bytes_structs:
+            if structure.data_type != 0:
+                structure.options &= ~_RANGE_BITS
     return dimensions
 
 
@@ -304,15 +308,6 @@ def _column_names(dimension: Any) -> list[str]:  # noqa: ANN401
     """Return the column names of a dimension."""
     name, count = dimension.name, dimension.num_elements
     return [name] if count == 1 else [f"{name}_{i}" for i in range(count)]
-
-
-def _clear_ranges(header: Any) -> None:  # noqa: ANN401
-    """Clear the ranges of extra dimensions, which laspy 2.7.0 sets from the first value."""
-    for record in header.vlrs.get("ExtraBytesVlr"):
-        for structure in record.extra_bytes_structs:
-            # For undocumented bytes the options are the number of bytes.
-            if structure.data_type != 0:
-                structure.options &= ~_RANGE_BITS
 
 
 def count_las(path: Path, size: int) -> int:

@@ -34,7 +34,10 @@ def write_vg(path: Path, cloud: Cloud) -> None:
             out.write("group_type: 0\nnum_group_parameters: 4\n")  # Type 0 is a plane.
             plane = _fit_plane(cloud.coordinates[rows])
             out.write(f"group_parameters: {' '.join(f'{value:.17g}' for value in plane)}\n")
-            out.write(f"group_label: plane_{index}\ngroup_color: {_group_color(index)}\n")
+            # A color that differs from the colors of earlier groups.
+            color = [0.2 + 0.7 * ((index + 1) * step % 1) for step in (0.618, 0.382, 0.854)]
+            out.write(f"group_label: plane_{index}\n")
+            out.write(f"group_color: {' '.join(f'{round(value, 4)}' for value in color)}\n")
             out.write(f"group_num_point: {len(rows)}\n{' '.join(map(str, rows))}\n")
             out.write("num_children: 0\n")
 
@@ -47,9 +50,3 @@ def _fit_plane(points: NDArray[np.floating]) -> NDArray[np.float64]:
     center = points.mean(axis=0)
     normal = np.linalg.eigh((points - center).T @ (points - center))[1][:, 0]
     return np.array([*normal, -normal @ center])
-
-
-def _group_color(index: int) -> str:
-    """Return a color that differs from the colors of earlier groups."""
-    colors = (0.2 + 0.7 * ((index + 1) * step % 1) for step in (0.618, 0.382, 0.854))
-    return " ".join(f"{round(color, 4)}" for color in colors)

@@ -129,7 +129,10 @@ def score_clusters(
         raise ConfigError(
             f"score_clusters: expected max_angle_deg in [0, 90], got {max_angle_deg!r}."
         )
-    directions, clusters, invalid = _labeled_directions(normals, labels, min_size)
+    _, rows, sizes = torch.unique(labels, return_inverse=True, return_counts=True)
+    labeled = (labels != UNLABELED) & (sizes >= min_size)[rows]
+    directions, exists = unit_vectors(normals[labeled])
+    directions, (_, clusters) = directions[exists], number_labels(labels[labeled][exists])
     centers, turned = find_centers(directions, clusters)
     if distinct_directions:
         clusters = merge_directions(centers, max_angle_deg=max_angle_deg)[clusters]
@@ -148,21 +151,10 @@ def score_clusters(
         dvi=_dunn(closest_between(directions, clusters), diameters),
         clusters=len(centers),
         points=len(clusters),
-        invalid=invalid,
+        invalid=int((~exists).sum()),
         sampled_clusters=num_sampled,
         dvi_exact=exact,
     )
-
-
-def _labeled_directions(
-    normals: Tensor, labels: Tensor, min_size: int
-) -> tuple[Tensor, Tensor, int]:
-    """Return unit normals and clusters of labeled points, and the number without a normal."""
-    sizes = torch.unique(labels, return_inverse=True, return_counts=True)[1:]
-    labeled = (labels != UNLABELED) & (sizes[1] >= min_size)[sizes[0]]
-    directions, exists = unit_vectors(normals[labeled])
-    _, clusters = number_labels(labels[labeled][exists])
-    return directions[exists], clusters, int((~exists).sum())
 
 
 def _separation(centers: Tensor, spreads: Tensor) -> tuple[float, float]:

@@ -80,10 +80,6 @@ class DepthTransform(SampleTransform):
             None if poses is None else self._expand("pose", poses, (len(depth), 4, 4)),
         )
 
-    def is_batch(self, sample: Entries) -> bool:
-        """Return whether the depth of a sample is a batch, ``(B, 1, H, W)``."""
-        return self.read(sample, "depth").ndim == 4
-
     def _expand(self, name: str, values: Tensor, shape: tuple[int, int, int]) -> Tensor:
         """Return one matrix per image; a single matrix applies to all images."""
         expanded = values.expand(shape) if values.shape == shape[1:] else values
@@ -132,7 +128,7 @@ class DepthToCloud(DepthTransform):
             self.key(sample, "coord"): images[seen],
             self.key(sample, "pixel"): pixel.expand_as(seen)[seen],
         }
-        if self.is_batch(sample):
+        if self.read(sample, "depth").ndim == 4:  # A batch.
             result[self.key(sample, "offset")] = seen.flatten(1).sum(dim=1).cumsum(dim=0)
         color = self.key(sample, "color")
         if color in sample:
@@ -211,7 +207,7 @@ class SegmentDepth(DepthTransform):
             segment_depth(image, camera, pose=None if poses is None else poses[i], **options)
             for i, (image, camera) in enumerate(zip(depth, intrinsics, strict=True))
         ]
-        batch, added = self.is_batch(sample), SampleDict(sample)
+        batch, added = self.read(sample, "depth").ndim == 4, SampleDict(sample)
         for name, field in (("plane", "labels"), ("normal", "normals"), ("curvature", "curvature")):
             images = [getattr(seg, field) for seg in segmentations]
             added[self.key(sample, name)] = torch.stack(images) if batch else images[0]
