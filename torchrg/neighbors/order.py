@@ -183,10 +183,8 @@ def expand_to_points(values: Tensor, inverse: Tensor, *, fill: float = 0) -> Ten
     """
     if len(values) == 0:
         return values.new_full((len(inverse), *values.shape[1:]), fill)
-    missing = nonzero_rows(inverse < 0)
-    if len(missing) == 0:
-        return values.index_select(0, inverse)
-    return values.index_select(0, inverse.clamp(min=0)).index_fill_(0, missing, fill)
+    missing = (inverse < 0).view(-1, *[1] * (values.ndim - 1))
+    return values.index_select(0, inverse.clamp(min=0)).masked_fill_(missing, fill)
 
 
 def morton_codes(coordinates: NDArray[np.floating]) -> NDArray[np.int64]:

@@ -280,12 +280,14 @@ def grow(cloud: GrowingInput, config: GrowingConfig, chunk_size: int) -> Tensor:
 
     Invalid points, and some points of regions below ``min_size``, have no root.
     """
-    growing, indices = cloud.curvature[cloud.valid], cloud.neighbors.indices.cpu()
+    columns = (cloud.curvature, cloud.valid, cloud.neighbors.indices)
+    curvature, valid, indices = (column.cpu() for column in columns)
+    growing = curvature[valid]
     limit = kth_smallest(growing, int(config.curvature_quantile * (len(growing) - 1)))
-    is_seed, valid = (cloud.curvature <= limit).cpu(), cloud.valid.cpu()
-    order = ascending_rows(cloud.curvature.cpu())
+    is_seed, order = curvature <= limit, ascending_rows(curvature)
     order = order[valid[order]].int()
-    joins, makes_seed = mark_edges(cloud, config, limit, chunk_size=chunk_size)
+    on_device = limit.to(cloud.points.device)
+    joins, makes_seed = mark_edges(cloud, config, on_device, chunk_size=chunk_size)
     if makes_seed is None and int(config.min_size) > indices.shape[1]:
         order = order[: int(torch.count_nonzero(growing <= limit))]
     tables, late = (indices, joins, makes_seed, is_seed, valid), has_late_promotion(config)
