@@ -115,7 +115,7 @@ def test_more_neighbors_and_levels_take_more():
     "work",
     [
         lambda points: measure_sampling(points, search_knn(points, 600, canonical=True)),
-        lambda points: estimate_normals(points[:1000], "consensus", k=600),
+        lambda points: estimate_normals(points[:1200], "consensus", k=600),
         lambda points: segment_planes(points, "classic", **{"normals.k": 600}),
         lambda points: fit_detmcd(points[:300, None] - points[:600]),
         lambda points: fit_fastmcd(points[:100], num_starts=100_000),

@@ -1,8 +1,11 @@
 """What every estimator promises, whatever it computes."""
 
+import warnings
+
 import pytest
 import torch
 
+from torchrg import segment_planes
 from torchrg.errors import ConfigError
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.neighbors import search_knn
@@ -210,3 +213,16 @@ def test_three_points_span_a_plane(method):
 def test_unknown_method_is_refused():
     with pytest.raises(ConfigError, match=r"method to be one of pca, .*, got 'best'"):
         estimate_normals(torch.rand(5, 3), method="best")
+
+
+@pytest.mark.parametrize("name", ["k", "adaptive_k"])
+def test_more_neighbors_than_a_cloud_has_are_refused(name, corner):
+    points = corner[0].repeat(10, 1)  # Copies are no neighbors.
+    message = rf"normals\.{name} of at most 512 for {COUNT} distinct points, got 100,000; lower"
+    with pytest.raises(ConfigError, match=f"estimate_normals: expected {message}"):
+        estimate_normals(points, **{name: 100_000})
+    with pytest.raises(ConfigError, match=f"segment_planes: expected {message}"):
+        segment_planes(points, **{f"normals.{name}": 100_000})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        estimate_normals(points, method="pca", k=512)
