@@ -20,11 +20,32 @@ from torchrg.datasets.rgbd_layouts import FRAME_LAYOUTS
 from torchrg.datasets.s3dis import find_areas
 from torchrg.depth import DepthConfig, segment_depth
 from torchrg.depth.camera import Pinhole
-from torchrg.io import Cloud, estimate_points, write_cloud
+from torchrg.errors import FormatError
+from torchrg.io import Cloud, estimate_points, read_cloud, write_cloud
 from torchrg.io.result import read_result
 from torchrg.pipeline import make_superpoints, segment_planes
 
 CLASSIC = load_config("classic")
+
+PLY_HEADER = """ply
+format ascii 1.0
+element vertex %d
+property float x
+property float y
+property float z
+end_header
+0 0 0
+"""
+PCD_HEADER = """VERSION .7
+FIELDS x y z
+SIZE 4 4 4
+TYPE F F F
+WIDTH %d
+HEIGHT 1
+POINTS %d
+DATA ascii
+0 0 0
+"""
 
 
 @pytest.mark.filterwarnings("ignore:.*expected .* rooms")
@@ -278,3 +299,20 @@ def test_points_are_counted_without_reading_them(tmp_path, suffix):
     assert estimate_points(path) == pytest.approx(780, rel=0 if suffix != ".xyz" else 0.02)
     path.write_bytes(path.read_bytes()[:20] if suffix != ".xyz" else b"")
     assert estimate_points(path) == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("a.las", np.random.default_rng(0).bytes(5000)),
+        ("b.laz", b"LASF" + bytes(20) + b"\1\2" + bytes(81) + b"\xff" * 4 + bytes(140)),
+        ("c.ply", PLY_HEADER % 10**15),
+        ("d.pcd", PCD_HEADER % (10**15, 10**15)),
+    ],
+)
+def test_a_file_too_small_for_its_number_of_points_is_corrupt(tmp_path, name, content):
+    path = tmp_path / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    assert estimate_points(path) == 0
+    with pytest.raises(FormatError, match=f"{name}: "):
+        read_cloud(path)

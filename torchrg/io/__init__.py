@@ -82,6 +82,10 @@ _CONVERTERS = {
 """Contents of files that are not read and the way to read them, with their suffixes."""
 TEXT_SUFFIXES = tuple(kind for kind, form in FORMATS.items() if form.read is read_text)
 """Suffixes of text files."""
+_COMPRESSED_SUFFIXES = (".npz", ".laz", ".pcd", ".e57")
+"""Suffixes of files that may be compressed. In other files a point takes at least a byte."""
+_MAX_POINTS_PER_BYTE = 1032
+"""Maximum number of points per byte of compressed files: the maximum ratio of deflate."""
 _PLANES_SUFFIX = ".vg"
 """Suffix of vertex groups, which are write-only and store coordinates, colors and planes."""
 
@@ -238,10 +242,14 @@ def estimate_points(path: Path) -> int:
     r"""Return the number of points of a file from its header, without reading the points.
 
     Text files have no header; for them and for E57 the number is estimated from the file size.
-    Returns 0 for a corrupt file or an unknown format, which reading reports.
+    Returns 0 for an unknown format or a corrupt file, such as one that is too small for its number
+    of points; reading reports them.
     """
+    limit = _MAX_POINTS_PER_BYTE if path.suffix.lower() in _COMPRESSED_SUFFIXES else 1
     try:
-        return _get_format(path).count(path, check_file(path))
+        size = check_file(path)
+        count = _get_format(path).count(path, size)
+        return count if count <= limit * size else 0
     except (OSError, FormatError, *ARCHIVE_ERRORS):
         return 0
 

@@ -312,6 +312,7 @@ def _column_names(dimension: Any) -> list[str]:  # noqa: ANN401
 
 def count_las(path: Path, size: int) -> int:
     """Return the number of points from the header; laspy is not needed."""
+    _check_header(path, size)
     with path.open("rb") as stream:
         head = stream.read(_COUNT14_AT + 8)
     (count,) = struct.unpack_from("<I", head, _COUNT_AT)
