@@ -390,3 +390,21 @@ def test_settings_that_keep_all_planes_have_the_up_axis_of_classes():
     assert load_config(kinds="wall").without_selection().planes.up == "z"
     assert load_config().without_selection().planes.up is None
     assert load_config("classic").measured(None) == {}
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: load_config(angle_deg=0.0872),
+        lambda: load_config({"growing.max_angle_deg": "0.0872"}),
+        lambda: GrowingConfig(absorb_angle_deg=0.0872),
+        lambda: DepthConfig(max_angle_deg=0.0872),
+    ],
+)
+def test_an_angle_in_radians_is_told(make, recwarn):
+    make()
+    message = "expected angles in degrees, got 0.0872; pass 5 if it is in radians."
+    assert {str(warning.message) for warning in recwarn} == {message}
+    recwarn.clear()
+    load_config({"growing.max_angle_deg": 0.5, "normals.sharp_angle_deg": 0})
+    assert not recwarn

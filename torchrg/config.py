@@ -20,7 +20,7 @@ from typing import Any, Literal, NoReturn, TypeVar
 import torch
 
 from torchrg._parallel import CHUNK_SIZE
-from torchrg.errors import ConfigError
+from torchrg.errors import ConfigError, warn
 from torchrg.structures import FARTHEST, PLANE_KINDS, PlaneKind, Sampling
 
 __all__ = [
@@ -714,7 +714,11 @@ def _fix_for(key: str, value: object, config: object, prefix: str) -> str:
 
 
 def check_values(config: Any) -> None:  # noqa: ANN401
-    """Convert settings to their annotated types, or raise; numbers are at most 1e12."""
+    """Convert settings to their annotated types, or raise; numbers are at most 1e12.
+
+    Warns:
+        UserWarning: If an angle seems to be in radians.
+    """
     kind = type(config)
     for name, hint in typing.get_type_hints(kind).items():
         value = getattr(config, name)
@@ -724,8 +728,15 @@ def check_values(config: Any) -> None:  # noqa: ANN401
         for number in value if isinstance(value, tuple) else (value,):
             is_far = isinstance(number, int | float) and abs(number) > FARTHEST
             expect(config, name, f"in [-{FARTHEST:g}, {FARTHEST:g}]", not is_far)
+        if name.endswith("_deg") and 0 < value < _MIN_ANGLE_DEG:
+            warn(
+                f"expected angles in degrees, got {value:g}; pass {math.degrees(value):.3g} if it "
+                "is in radians."
+            )
 
 
+_MIN_ANGLE_DEG = 0.5
+"""Minimum angle without a warning, in degrees. Presets use 5 and more, 0.09 in radians."""
 _BOOLS = dict.fromkeys(("true", "on", "yes"), True) | dict.fromkeys(("false", "off", "no"), False)
 """Words for booleans, as in YAML."""
 _TYPE_NAMES = {
