@@ -101,6 +101,22 @@ def test_what_is_done_is_kept_and_a_bad_file_stops_no_other(rooms, converted, tm
     assert "1 of 1 scans are complete" in done.out
 
 
+def test_failures_of_scans_that_a_run_omits_stay_in_the_report(rooms, tmp_path, convert):
+    shutil.copytree(rooms, tmp_path / "in")
+    for name in ("bad", "worse"):
+        (tmp_path / "in" / f"{name}.ply").write_text("ply\nformat")
+    command = ("folder", tmp_path / "in", tmp_path / "out")
+    assert convert(*command, "--workers", 1).code == 3
+    assert convert(*command, "--workers", 1, "--only", "hall", "--force").code == 0
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["scans_by_status"]["failed"] == 2
+    assert "\n2 scans to convert, 0 done" in convert(*command, "--only-failed", "--dry-run").out
+    shutil.copy(rooms / "east" / "office.npy", tmp_path / "in" / "bad.npy")
+    (tmp_path / "in" / "bad.ply").unlink()
+    assert convert(*command, "--workers", 1, "--only", "bad").code == 0
+    assert "\n1 scans to convert, 0 done" in convert(*command, "--only-failed", "--dry-run").out
+
+
 def test_a_dry_run_writes_nothing(rooms, tmp_path, convert):
     shown = convert("folder", rooms, tmp_path / "out", "--dry-run", "--only", "east/*").out
     assert "1 scans to convert" in shown

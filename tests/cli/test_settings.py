@@ -59,3 +59,11 @@ def test_defaults_are_shown_as_words_that_are_accepted(section):
         for word in re.findall(r"Default: (\S+)\.$", flag.text):
             shown = convert(word, flag.hint, flag.name)
             assert convert(str(shown).strip("()"), flag.hint, flag.name) == shown
+
+
+@pytest.mark.filterwarnings("always:expected angles")
+def test_an_angle_in_radians_is_told_once(tmp_path, run):
+    cloud = tmp_path / "room.npz"
+    assert run("sample", cloud, "--num-points", 2000).code == 0
+    done = run("segment", cloud, "--out", tmp_path / "out.npz", "--angle-deg", "0.0872")
+    assert done.err.count("expected angles in degrees, got 0.0872; pass 5") == 1

@@ -5,7 +5,7 @@ import json
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from fnmatch import fnmatchcase
@@ -317,10 +317,17 @@ def run_plan(
     return BatchReport(tuple(scans), started, seconds, engine, workers, interrupted, root)
 
 
-def write_report(out: Path, report: BatchReport) -> None:
-    """Write ``report.json`` into the output directory; raise FormatError on failure."""
+def write_report(out: Path, report: BatchReport, others: Collection[str] = ()) -> None:
+    """Write ``report.json`` into the output directory; raise FormatError on failure.
+
+    Failures of ``others``, scans that this run did not select, are kept from the last report.
+    """
+    record, last = report.to_json(), read_report(out)
+    failed = [scan for scan in _failed_scans(last) if scan["name"] in others]
+    record["scans"] += failed
+    record["scans_by_status"]["failed"] += len(failed)
     with atomic_path(out / REPORT, mark=OUTPUT_MARK) as temporary:
-        temporary.write_text(json.dumps(report.to_json(), indent=1) + "\n", encoding="utf-8")
+        temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
 
 
 def read_report(out: Path) -> Record:
@@ -333,7 +340,7 @@ def read_report(out: Path) -> Record:
 
 
 def read_failed(out: Path) -> set[str]:
-    """Return the names of the scans that failed in the last run.
+    """Return the names of the scans that failed when they were last converted.
 
     Raises:
         ConfigError: If there is no report of a run.
@@ -342,4 +349,9 @@ def read_failed(out: Path) -> set[str]:
         raise ConfigError(
             f"{out / REPORT}: expected the report of an earlier run, got none; omit --only-failed."
         )
-    return {scan["name"] for scan in report["scans"] if scan["status"] == "failed"}
+    return {scan["name"] for scan in _failed_scans(report)}
+
+
+def _failed_scans(report: Record) -> list[Record]:
+    """Return the failed scans of a report."""
+    return [scan for scan in report.get("scans", ()) if scan["status"] == "failed"]

@@ -1,5 +1,6 @@
 """Command line: ``torchrg COMMAND ...``."""
 
+import functools
 import gc
 import importlib
 import sys
@@ -92,6 +93,7 @@ def _run(arguments: list[str]) -> int:
     with ending.raising_interrupts(), warnings.catch_warnings():
         # Commands print the precision of each file themselves (check_finite).
         warnings.simplefilter("ignore", PrecisionWarning)
-        warnings.showwarning = lambda message, *_, **__: ending.warn(" ".join(str(message).split()))
+        warn_once = functools.cache(ending.warn)  # Settings are checked after every change.
+        warnings.showwarning = lambda message, *_, **__: warn_once(" ".join(str(message).split()))
         code: int = command.run(remaining)
     return code

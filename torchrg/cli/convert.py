@@ -83,7 +83,7 @@ class Arguments:
     only: str | None = None
     """Shell pattern of scans to convert, such as "Area_5/*". Results of missing scans are kept."""
     only_failed: bool = False
-    """Convert only scans that failed in the last run, by OUT/report.json."""
+    """Convert only scans that failed when they were last converted, by OUT/report.json."""
     force: bool = False
     """Convert finished scans again."""
     prune: bool = False
@@ -407,7 +407,7 @@ def _convert(plan: Plan, scans: list[Job], arguments: Arguments) -> int:
     # Files come before lines, whose reader may have gone.
     unreported = ""
     try:
-        write_report(out, report)
+        write_report(out, report, {job.name for job in scans} - {job.name for job in plan.jobs})
     except FormatError as error:
         unreported = str(error)
     if not report.disk_full:
