@@ -218,3 +218,12 @@ def test_add_note_by_example():
     error = ValueError("expected a floor")
     add_note(error, "This was room 3.")
     assert "room 3" in "".join(traceback.format_exception(error))
+
+
+def test_rooms_of_s3dis_are_told(root):
+    (root / "office_1" / "Annotations").mkdir(parents=True)
+    write_cloud(root / "office_1" / "Annotations" / "wall_1.txt", Cloud(COORDINATES))
+    with pytest.warns(
+        UserWarning, match=r"scans: folders Annotations .* use torchrg convert s3dis"
+    ):
+        FolderOfClouds(root)

@@ -84,6 +84,10 @@ def test_missing_areas_are_errors_with_the_repair(root):
         S3DIS(root)
     with pytest.raises(FormatError, match=r"got none; pass .*Aligned_Version"):
         S3DIS(root.parent)
+    for folder in ("Area_1", "Area_1/office_0"):
+        (root / "Area_1" / "office_0").mkdir(parents=True, exist_ok=True)
+        with pytest.raises(FormatError, match=rf"expected a folder Area_1, .* pass {root}\."):
+            S3DIS(root / folder)
     with pytest.raises(ConfigError, match="expected areas among 1, 2, 3, 4, 5, 6, got 7"):
         S3DIS(root, [7])
 

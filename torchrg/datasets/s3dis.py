@@ -20,7 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrg._optional import require
-from torchrg.datasets.folder import SceneDataset, SceneFiles, Transform, check_folder, list_dir
+from torchrg.datasets.folder import (
+    ANNOTATIONS,
+    SceneDataset,
+    SceneFiles,
+    Transform,
+    check_folder,
+    list_dir,
+)
 from torchrg.errors import ConfigError, FormatError, warn
 from torchrg.io import estimate_points
 from torchrg.io.arrow import parse_numbers
@@ -42,7 +49,6 @@ CLASS_ORDERS: dict[str, tuple[str, ...]] = {
 and writes, and in the order of Superpoint Transformer and KPConv."""
 ROOMS_PER_AREA = {1: 44, 2: 40, 3: 23, 4: 49, 5: 68, 6: 48}
 """Number of rooms per area in the release, 272 in all."""
-ANNOTATIONS = "Annotations"
 _OBJECT = re.compile(r"([A-Za-z]+)_([0-9]+)(?: \(([0-9]+)\))?")
 """Names of object files and their copies."""
 _NUM_COLUMNS = 6
@@ -116,8 +122,9 @@ def _list_area(root: Path, area: int) -> list[SceneFiles]:
     folder = root / f"Area_{area}"
     check_folder(root)
     if not folder.is_dir():
-        inside = [path.parent for path in root.glob("*/Area_[1-6]")]
-        repair = f"pass {inside[0]}" if inside else "select existing areas, or download it again"
+        others = [path.parent for path in root.glob("*/Area_[1-6]")]
+        others += [path for path in root.absolute().parents if any(path.glob("Area_[1-6]"))]
+        repair = f"pass {others[0]}" if others else "select existing areas, or download it again"
         raise FormatError(f"{root}: expected a folder {folder.name}, got none; {repair}.")
     entries = [path for path in list_dir(folder) if path.is_dir() and not path.name.startswith(".")]
     rooms = [path for path in entries if (path / ANNOTATIONS).is_dir()]
