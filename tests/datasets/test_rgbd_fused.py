@@ -116,3 +116,9 @@ def test_settings_of_planes_apply_to_the_map(tmp_path, run):
     for wrong in (("--fuse", 0), ("--fuse", VOXEL, "--depth.min-size", "5")):
         error = run("convert", "rgbd", root, out, *wrong).error
         assert "expected --fuse > 0 without --depth.noise, max-angle-deg, max-step or min" in error
+
+
+def test_a_voxel_size_in_another_unit_is_told(tmp_path, run):
+    root = write_stray(tmp_path / "capture")
+    done = run("convert", "rgbd", root, tmp_path / "out", "--fuse", 20, "--workers", "1")
+    assert "voxel 20 leaves 1 of" in done.out

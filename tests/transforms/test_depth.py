@@ -9,7 +9,7 @@ from tests.made import build_scanned_room, cameras_around, render_depth
 from torchrg.datasets import RGBDFrame
 from torchrg.depth import segment_depth
 from torchrg.depth.camera import depth_to_points, find_intrinsics, make_intrinsics
-from torchrg.errors import ConfigError, ShapeError
+from torchrg.errors import CloudWarning, ConfigError, ShapeError
 from torchrg.structures import UNLABELED, Planes
 from torchrg.transforms import DepthToCloud, SegmentDepth, fuse_depth
 
@@ -172,6 +172,11 @@ def test_fused_frames_remember_frame_and_pixel(frames):
     for frame, image in zip(frames, fused.to_frames(labels), strict=True):
         expected = torch.where(frame.depth > 0, frame.labels, UNLABELED)
         assert torch.equal(image, expected)
+
+
+def test_a_voxel_size_in_another_unit_is_told(frames):
+    with pytest.warns(CloudWarning, match=r"fuse_depth: voxel 20 leaves 1 of [\d,]+ points; check"):
+        fuse_depth(map(sample_of, frames), voxel_size=20)
 
 
 def test_labels_of_voxels_go_back_into_every_frame(frames):

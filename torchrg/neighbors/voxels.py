@@ -9,13 +9,15 @@ from torch import Tensor
 
 from torchrg import scratch
 from torchrg._checks import as_tensor, check_points, is_positive
-from torchrg.errors import ConfigError
+from torchrg.errors import CloudWarning, ConfigError, warn
 from torchrg.neighbors.order import mark_distinct
 from torchrg.structures import UNLABELED, AnyCloud
 from torchrg.structures.points import short_repr
 
 _MAX_VOXELS = 2**53
 """Maximum number of voxels along one axis: float64 counts no further."""
+_MIN_VOXELS = 3
+"""Minimum number of voxels with a plane."""
 _MAX_KEYS = 2**62
 """Maximum number of cells with distinct int64 keys; above the squared number of points."""
 
@@ -80,6 +82,20 @@ def sample_voxels(points: AnyCloud, size: float) -> Voxels:
     ranks = rows.argsort().argsort()
     inverse[order] = ranks[voxel]
     return Voxels(rows.sort().values, scratch.store(inverse))
+
+
+def warn_about_voxel(caller: str, size: float, num_voxels: int, num_points: int) -> None:
+    """Warn if a voxel size leaves all points, or too few for a plane: it may be in another unit."""
+    result = ""
+    if num_voxels < _MIN_VOXELS <= num_points:
+        result = f"{num_voxels:,} of {num_points:,} points"
+    elif num_voxels == num_points > 0:
+        result = f"all {num_points:,} points"
+    if result:
+        warn(
+            f"{caller}: voxel {size:g} leaves {result}; check that it is in units of the cloud.",
+            CloudWarning,
+        )
 
 
 def _first_by_coordinates(chosen: Tensor, voxel: Tensor, columns: Sequence[Tensor]) -> Tensor:

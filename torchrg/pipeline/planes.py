@@ -24,6 +24,7 @@ from torchrg.neighbors import (
 )
 from torchrg.neighbors.knn import restrict_to_groups, search_distinct
 from torchrg.neighbors.order import DistinctPoints
+from torchrg.neighbors.voxels import warn_about_voxel
 from torchrg.normals.estimators import check_num_neighbors, run_estimator
 from torchrg.normals.orient import Orientation, choose_side, find_directions, turn_faces
 from torchrg.regions import grow_regions, summarize_planes
@@ -39,8 +40,6 @@ _MIN_NEIGHBORHOODS = 2
 """Minimum number of points of a cloud, in neighborhoods; fewer points have one plane for all."""
 _UP = torch.tensor([0.0, 0.0, 1.0])
 """Up axis of clouds for which none is set."""
-_MIN_SITES = 3
-"""Minimum number of points with a plane."""
 
 
 @eager_only
@@ -277,16 +276,7 @@ def _find_sites(distinct: DistinctPoints, voxel: float | None) -> _Sites:
     order = canonical_order(distinct.points[voxels.rows])
     site = scratch.store(order.argsort()[voxels.inverse])
     site = scratch.store(distinct.restore(site, fill=UNLABELED))
-    num_voxels, num_points, result = len(order), len(distinct.points), ""
-    if num_voxels < _MIN_SITES <= num_points:
-        result = f"leaves {num_voxels:,} of {num_points:,} points"
-    elif num_voxels == num_points > 0:
-        result = f"leaves all {num_points:,} points"
-    if result:
-        warn(
-            f"segment_planes: voxel {voxel:g} {result}; check that it is in units of the cloud.",
-            CloudWarning,
-        )
+    warn_about_voxel("segment_planes", voxel, len(order), len(distinct.points))
     return _Sites(scratch.store(distinct.points[voxels.rows[order]]), site)
 
 

@@ -12,6 +12,7 @@ from torchrg._checks import as_tensor, check_choices, eager_only
 from torchrg.config import DepthConfig, settings_of
 from torchrg.errors import ConfigError, ShapeError
 from torchrg.neighbors import expand_to_points, sample_voxels
+from torchrg.neighbors.voxels import warn_about_voxel
 from torchrg.normals import Orientation
 from torchrg.structures import UNLABELED, Planes
 from torchrg.structures.points import short_repr
@@ -280,6 +281,9 @@ def fuse_depth(samples: Iterable[Entries], *, voxel_size: float | None = None) -
 
     Raises:
         ConfigError: If there is no sample, one lacks a pose, or ``voxel_size`` is not positive.
+
+    Warns:
+        CloudWarning: If ``voxel_size`` leaves all points or fewer than three.
         ShapeError: If a shape is not as above.
 
     Example:
@@ -318,6 +322,7 @@ def fuse_depth(samples: Iterable[Entries], *, voxel_size: float | None = None) -
     inverse = torch.arange(len(coord), device=coord.device)
     if voxel_size is not None:
         rows, inverse = sample_voxels(coord, voxel_size)
+        warn_about_voxel("fuse_depth", voxel_size, len(rows), len(coord))
         coord, frame, pixel = coord[rows], frame[rows], pixel[rows]
         color = None if color is None else color[rows]
     return FusedFrames(coord, color, frame, pixel, inverse, tuple(seen))
