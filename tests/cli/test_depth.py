@@ -326,3 +326,8 @@ def test_a_panorama_is_doubted(tmp_path, run):
     flags = ["--intrinsics", "40,40,39.5,19.5", "--depth-scale", "1", "--out", tmp_path / "a.png"]
     error = run("depth", tmp_path / "a.npy", *flags).err
     assert "of a panorama, by its ratio of 2:1; project it to perspective images" in error
+
+
+def test_labels_of_another_image_format_are_refused(frame, tmp_path, run):
+    error = run("depth", frame, *CAMERA, "--out", tmp_path / "labels.jpg").error
+    assert "expected a file ending in one of .png .npz .npy" in error

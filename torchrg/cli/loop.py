@@ -43,7 +43,7 @@ def output_paths(inputs: Sequence[Path], out: Path, *, suffix: str = ".npz") -> 
         raise FormatError("expected at least one input file, got none.")
     ending = out.suffix.lower()
     if suffix and len(inputs) == 1 and not out.is_dir():
-        check_writable(out) if ending == suffix else check_output(out)
+        check_output(out, other=suffix)
         return [out]
     for path in inputs:  # A word after a switch is taken for an input.
         if not path.exists():

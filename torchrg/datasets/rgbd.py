@@ -338,7 +338,8 @@ def _find_frames(
                 if chosen is None:
                     missing, example = "intrinsics", "fx,fy,cx,cy or a camera file"
                 raise ConfigError(
-                    f"{frame.depth}: expected {missing}, which images lack; pass it, {example}."
+                    f"{frame.depth}: expected {missing}, which images lack; pass it "
+                    f"(--{missing.replace('_', '-')}), {example}."
                 )
             if not camera and not files:
                 numbers = ",".join(f"{number:g}" for number in chosen[:4])

@@ -221,17 +221,19 @@ def write_cloud(
     _get_writer(target)(target, replace(cloud, fields=fields))
 
 
-def check_output(path: FilePath, cloud: Cloud | None = None) -> None:
+def check_output(path: FilePath, cloud: Cloud | None = None, *, other: str = "") -> None:
     """Check an output path before long work: known suffix, existing writable folder.
 
-    ``cloud`` is the cloud to write, if already known: LAS cannot store non-finite points.
+    ``cloud`` is the cloud to write, if already known: LAS cannot store non-finite points. ``other``
+    is a suffix that the caller itself writes, such as ``.png``.
 
     Raises:
         FormatError: If :func:`write_cloud` would reject the path or the cloud.
         MissingDependencyError: If the format needs an optional package.
     """
     target = Path(path)
-    _get_writer(target)
+    if target.suffix.lower() != other:
+        _get_writer(target, other)
     check_writable(path)
     fmt = FORMATS.get(target.suffix.lower())
     if fmt is not None and fmt.check is not None:
@@ -254,25 +256,26 @@ def estimate_points(path: Path) -> int:
         return 0
 
 
-def _get_format(path: Path, *, for_writing: bool = False) -> Format:
-    """Return the format of a file to read or write, by its suffix."""
+def _get_format(path: Path, other: str = "", *, for_writing: bool = False) -> Format:
+    """Return the format of a file to read or write, by its suffix; see :func:`check_output`."""
     suffix = path.suffix.lower()
     content = next((what for what, kinds in _CONVERTERS.items() if suffix in kinds.split()), "")
     if content and not for_writing:
         raise FormatError(f"{path}: expected points, got {content}.")
     if suffix not in FORMATS:
         suffixes = [kind for kind, format_ in FORMATS.items() if format_.write or not for_writing]
+        endings = " ".join(dict.fromkeys([*filter(None, [other]), *suffixes]))
         raise FormatError(
-            f"{path}: expected a file ending in one of {' '.join(suffixes)}, got {path.suffix!r}."
+            f"{path}: expected a file ending in one of {endings}, got {path.suffix!r}."
         )
     return FORMATS[suffix]
 
 
-def _get_writer(path: Path) -> Callable[[Path, Cloud], None]:
+def _get_writer(path: Path, other: str = "") -> Callable[[Path, Cloud], None]:
     """Return the writer of a file, by its suffix."""
     if path.suffix.lower() == _PLANES_SUFFIX:
         return write_vg
-    write = _get_format(path, for_writing=True).write
+    write = _get_format(path, other, for_writing=True).write
     if write is None:
         raise FormatError(f"{path}: {path.suffix} can be read but not written. Use .laz or .ply.")
     return write
