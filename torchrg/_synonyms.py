@@ -17,7 +17,7 @@ _SYNONYMS = {
     "exclude": "ignore omit skip",
     "force": "overwrite rerun",
     "intrinsics": "camera camera_matrix",
-    "k": "k_neighbors k_search knn max_nn n_neighbors num_neighbors",
+    "k": "k_neighbors k_search knn max_nn n_neighbors nb_neighbors num_neighbors",
     "kinds": "categories classes",
     "limit_memory": "max_memory memory ram",
     "max_angle_deg": "angle_threshold max_angle maximum_angle normal_threshold "
@@ -26,6 +26,7 @@ _SYNONYMS = {
     "merge": "concat concatenate fuse",
     "method": "estimator normal_method",
     "min_size": "min_cluster_size min_num_points min_points min_pts min_region_size min_samples",
+    "num_points": "n n_points number_of_points samples size",
     "only_failed": "failed failed_only retry",
     "orient": "orientation",
     "out": _OUTPUT,
@@ -42,6 +43,8 @@ _ADVICE = {
     "the device is that of the points, for commands the CPU; leave it out": "cuda device gpu",
     "only commands print progress, to standard error; 2>/dev/null hides it": "debug log_level "
     "quiet silent verbose",
+    "coordinates keep their reference system; PDAL converts them to another": "crs epsg proj srs",
+    "lengths are in the unit of the cloud; leave it out, or scale the coordinates": "unit units",
     "distances to planes follow from the noise; growing.facet_tolerance merges regions within a "
     "distance, and growing.max_distance bounds gaps": "dist_threshold distance_threshold eps "
     "epsilon",

@@ -180,11 +180,13 @@ def _is_list(hint: object) -> bool:
 
 
 def _continues(values: Sequence[str], hint: object, argument: str) -> bool:
-    """Return whether an argument is a further value of a list: a number, or a text."""
+    """Return whether an argument is a further value of a list: a number, a text, or a choice."""
     kinds = [kind for kind in kinds_of(hint) if typing.get_origin(kind) is tuple]
     items = typing.get_args(kinds[0]) if kinds else ()
     if not items or (... not in items and len(values) == len(items)):
         return False
+    if argument in typing.get_args(items[0]):
+        return True
     is_text = items[0] is str and not _is_name(argument)
     return is_text or (items[0] in (int, float) and _NUMBER.fullmatch(argument) is not None)
 

@@ -15,7 +15,7 @@ from torchrg.errors import FormatError
 from torchrg.io.columns import check_field
 from torchrg.io.e57 import count_e57, read_e57
 from torchrg.io.fields import add_result_fields, convert_coordinates
-from torchrg.io.files import ARCHIVE_ERRORS, check_file, check_writable, local_path
+from torchrg.io.files import ARCHIVE_ERRORS, check_file, check_writable, local_path, wrap_errors
 from torchrg.io.las import check_las, count_las, read_las, write_las
 from torchrg.io.npy import count_npy, count_npz, read_npy, read_npz, write_npy, write_npz
 from torchrg.io.pcd import count_pcd, read_pcd, write_pcd
@@ -80,6 +80,16 @@ _CONVERTERS = {
     ),
 }
 """Contents of files that are not read and the way to read them, with their suffixes."""
+_SIGNATURES = {
+    b"PK\x03\x04": ".npz or .zip",
+    b"\x93NUMPY": ".npy",
+    b"LASF": ".las or .laz",
+    b"ASTM-E57": ".e57",
+    b"ply\n": ".ply",
+    b"ply\r": ".ply",
+    b"# .PCD": ".pcd",
+}
+"""Suffixes of files by their first bytes."""
 TEXT_SUFFIXES = tuple(kind for kind, form in FORMATS.items() if form.read is read_text)
 """Suffixes of text files."""
 _COMPRESSED_SUFFIXES = (".npz", ".laz", ".pcd", ".e57")
@@ -126,6 +136,7 @@ def read_cloud(path: FilePath, *, columns: Sequence[str] | None = None) -> Cloud
     """
     source = local_path(path)
     size, fmt = check_file(source), _get_format(source)
+    _check_signature(source)
     if columns is not None and not takes_columns(source):
         raise FormatError(f"{source}: column names apply to text and .npy files only; omit them.")
     names = () if columns is None else (columns,)
@@ -269,6 +280,17 @@ def _get_format(path: Path, other: str = "", *, for_writing: bool = False) -> Fo
             f"{path}: expected a file ending in one of {endings}, got {path.suffix!r}."
         )
     return FORMATS[suffix]
+
+
+def _check_signature(path: Path) -> None:
+    """Raise FormatError if the first bytes of a file are those of another format."""
+    with wrap_errors(f"{path}: cannot be read: ", OSError), path.open("rb") as stream:
+        start = stream.read(max(map(len, _SIGNATURES)))
+    kinds = next((kinds for first, kinds in _SIGNATURES.items() if start.startswith(first)), "")
+    if kinds and path.suffix.lower() not in kinds.split(" or "):
+        raise FormatError(
+            f"{path}: byte 0: expected a {path.suffix} file, got a {kinds} file; rename it."
+        )
 
 
 def _get_writer(path: Path, other: str = "") -> Callable[[Path, Cloud], None]:
