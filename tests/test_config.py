@@ -403,7 +403,7 @@ def test_settings_that_keep_all_planes_have_the_up_axis_of_classes():
 )
 def test_an_angle_in_radians_is_told(make, recwarn):
     make()
-    message = "expected angles in degrees, got 0.0872; pass 5 if it is in radians."
+    message = "expected degrees, not radians, got 0.0872; pass 5."
     assert {str(warning.message) for warning in recwarn} == {message}
     recwarn.clear()
     load_config({"growing.max_angle_deg": 0.5, "normals.sharp_angle_deg": 0})

@@ -26,7 +26,7 @@ _SYNONYMS = {
     "merge": "concat concatenate fuse",
     "method": "estimator normal_method",
     "min_size": "min_cluster_size min_num_points min_points min_pts min_region_size min_samples",
-    "num_points": "n n_points number_of_points samples size",
+    "num_points": "n n_points number_of_points",
     "only_failed": "failed failed_only retry",
     "orient": "orientation",
     "out": _OUTPUT,

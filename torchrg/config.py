@@ -21,6 +21,7 @@ import torch
 
 from torchrg._parallel import CHUNK_SIZE
 from torchrg.errors import ConfigError, warn
+from torchrg.kernels import MAX_NEIGHBORS
 from torchrg.structures import FARTHEST, PLANE_KINDS, PlaneKind, Sampling
 
 __all__ = [
@@ -100,6 +101,19 @@ class NormalsConfig:
         expect(self, "support_fraction", "in [0.5, 1]", 0.5 <= self.support_fraction <= 1)
         expect(self, "inlier_quantile", "in (0, 1)", 0 < self.inlier_quantile < 1)
         expect(self, "irls_decay", "> 1", self.irls_decay > 1)
+
+    def check_num_points(self, caller: str, num_points: int) -> None:
+        """Raise ConfigError if neighborhoods beyond the kernels hold over half of distinct points.
+
+        Small clouds use all of their points up to the maximum of the kernels.
+        """
+        limit = max(num_points // 2, MAX_NEIGHBORS)
+        for name, k in (("k", self.k), ("adaptive_k", self.adaptive_k or 0)):
+            if k > limit:
+                raise ConfigError(
+                    f"{caller}: expected normals.{name} of at most {limit:,} for {num_points:,} "
+                    f"distinct points, got {k:,}; lower it, as 50 suits most clouds."
+                )
 
     def with_sampling(self, sampling: Sampling) -> "NormalsConfig":
         """Resolve ``auto`` values; see :meth:`PipelineConfig.with_sampling`."""
@@ -714,11 +728,7 @@ def _fix_for(key: str, value: object, config: object, prefix: str) -> str:
 
 
 def check_values(config: Any) -> None:  # noqa: ANN401
-    """Convert settings to their annotated types, or raise; numbers are at most 1e12.
-
-    Warns:
-        UserWarning: If an angle seems to be in radians.
-    """
+    """Convert settings to their types, numbers of at most 1e12, or raise; warn about radians."""
     kind = type(config)
     for name, hint in typing.get_type_hints(kind).items():
         value = getattr(config, name)
@@ -729,10 +739,7 @@ def check_values(config: Any) -> None:  # noqa: ANN401
             is_far = isinstance(number, int | float) and abs(number) > FARTHEST
             expect(config, name, f"in [-{FARTHEST:g}, {FARTHEST:g}]", not is_far)
         if name.endswith("_deg") and 0 < value < _MIN_ANGLE_DEG:
-            warn(
-                f"expected angles in degrees, got {value:g}; pass {math.degrees(value):.3g} if it "
-                "is in radians."
-            )
+            warn(f"expected degrees, not radians, got {value:g}; pass {math.degrees(value):.3g}.")
 
 
 _MIN_ANGLE_DEG = 0.5

@@ -153,3 +153,17 @@ def test_reason_for_no_plane_by_example():
 
 def test_split_columns_by_example():
     assert split_columns("x, y,z,_") == ("x", "y", "z", "_")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("segment a.ply --out b.npz --nb-neighbors 30", "Did you mean --normals.k?"),
+        ("segment a.ply --out b.npz --unit m", "--unit: lengths are in the unit of the cloud"),
+        ("segment a.ply --out b.npz --crs 25832", "--crs: coordinates keep their reference system"),
+        ("segment a.ply --kinds wall floor --out b.npz", "a.ply: file not found"),
+        ("sample a.ply -n 5000", "option -n. Did you mean --num-points?"),
+    ],
+)
+def test_words_of_other_programs_have_advice(words, message, run):
+    assert message in run(*words.split()).error

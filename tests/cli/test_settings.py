@@ -61,9 +61,9 @@ def test_defaults_are_shown_as_words_that_are_accepted(section):
             assert convert(str(shown).strip("()"), flag.hint, flag.name) == shown
 
 
-@pytest.mark.filterwarnings("always:expected angles")
+@pytest.mark.filterwarnings("always:expected degrees")
 def test_an_angle_in_radians_is_told_once(tmp_path, run):
     cloud = tmp_path / "room.npz"
     assert run("sample", cloud, "--num-points", 2000).code == 0
     done = run("segment", cloud, "--out", tmp_path / "out.npz", "--angle-deg", "0.0872")
-    assert done.err.count("expected angles in degrees, got 0.0872; pass 5") == 1
+    assert done.err.count("expected degrees, not radians, got 0.0872; pass 5") == 1

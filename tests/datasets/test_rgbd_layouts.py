@@ -307,7 +307,9 @@ def test_an_image_of_replica_beyond_its_poses_has_none(tmp_path):
 def test_the_unit_of_floating_point_is_not_guessed(tmp_path, run):
     root = write_nerfstudio(tmp_path / "capture", ".npy", 1.0)
     error = run("convert", "rgbd", root, tmp_path / "out").error
-    assert "frame_00000.npy: expected depth_scale, which images lack; pass it (--depth-scale)" in error
+    assert (
+        "frame_00000.npy: expected depth_scale, which images lack; pass it (--depth-scale)" in error
+    )
     data = RGBDFrames.from_folder(root, depth_scale=1.0)
     np.testing.assert_allclose(points_of(data[1]), FRAMES[1].points, atol=1e-5)
 

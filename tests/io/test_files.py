@@ -183,3 +183,19 @@ def test_normalize_file_name_by_example():
 def test_split_words_by_example():
     assert split_words("property float höhe".encode()) == ["property", "float", "höhe"]
     assert split_words(b"property float h\xf6he") == ["property", "float", "höhe"]
+
+
+@pytest.mark.parametrize(
+    ("content", "name", "kinds"),
+    [
+        (b"PK\3\4 and so on", "a.ply", ".npz or .zip"),
+        (b"\x93NUMPY and so on", "a.xyz", ".npy"),
+        (b"LASF and so on", "a.pcd", ".las or .laz"),
+        (b"ply\nformat ascii 1.0", "a.txt", ".ply"),
+    ],
+)
+def test_a_file_with_the_suffix_of_another_format_is_told(tmp_path, content, name, kinds):
+    (tmp_path / name).write_bytes(content)
+    message = f"{name}: byte 0: expected a {name[1:]} file, got a {kinds} file; rename it"
+    with pytest.raises(FormatError, match=message):
+        read_cloud(tmp_path / name)

@@ -5,9 +5,12 @@ import pytest
 import torch
 
 from tests.kernels.clouds import definitions, needs_library
+from torchrg import estimate_normals, segment_planes
+from torchrg.errors import CloudWarning
 from torchrg.neighbors.order import (
     ascending_rows,
     canonical_order,
+    distinct_points,
     distinct_rows,
     mark_distinct,
     morton_codes,
@@ -68,3 +71,12 @@ def test_scatter_rows_by_example():
         -1,
         7,
     ]
+
+
+def test_a_cloud_without_finite_points_is_told():
+    cloud = torch.full((30, 3), torch.nan)
+    for find in (distinct_points, segment_planes, estimate_normals):
+        with pytest.warns(CloudWarning, match="expected finite points, got none of 30") as caught:
+            find(cloud)
+        assert len(caught) == 1
+    assert len(distinct_points(torch.zeros(0, 3)).rows) == 0

@@ -323,7 +323,8 @@ def write_report(out: Path, report: BatchReport, others: Collection[str] = ()) -
     Failures of ``others``, scans that this run did not select, are kept from the last report.
     """
     record, last = report.to_json(), read_report(out)
-    failed = [scan for scan in _failed_scans(last) if scan["name"] in others]
+    known = [scan for scan in last.get("scans", ()) if scan["name"] in others]
+    failed = [scan for scan in known if scan["status"] == "failed"]
     record["scans"] += failed
     record["scans_by_status"]["failed"] += len(failed)
     with atomic_path(out / REPORT, mark=OUTPUT_MARK) as temporary:
@@ -349,9 +350,4 @@ def read_failed(out: Path) -> set[str]:
         raise ConfigError(
             f"{out / REPORT}: expected the report of an earlier run, got none; omit --only-failed."
         )
-    return {scan["name"] for scan in _failed_scans(report)}
-
-
-def _failed_scans(report: Record) -> list[Record]:
-    """Return the failed scans of a report."""
-    return [scan for scan in report.get("scans", ()) if scan["status"] == "failed"]
+    return {scan["name"] for scan in report["scans"] if scan["status"] == "failed"}

@@ -185,9 +185,7 @@ def _continues(values: Sequence[str], hint: object, argument: str) -> bool:
     items = typing.get_args(kinds[0]) if kinds else ()
     if not items or (... not in items and len(values) == len(items)):
         return False
-    if argument in typing.get_args(items[0]):
-        return True
-    is_text = items[0] is str and not _is_name(argument)
+    is_text = argument in typing.get_args(items[0]) or (items[0] is str and not _is_name(argument))
     return is_text or (items[0] in (int, float) and _NUMBER.fullmatch(argument) is not None)
 
 

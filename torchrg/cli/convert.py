@@ -83,7 +83,7 @@ class Arguments:
     only: str | None = None
     """Shell pattern of scans to convert, such as "Area_5/*". Results of missing scans are kept."""
     only_failed: bool = False
-    """Convert only scans that failed when they were last converted, by OUT/report.json."""
+    """Convert only scans whose last run failed, by OUT/report.json."""
     force: bool = False
     """Convert finished scans again."""
     prune: bool = False

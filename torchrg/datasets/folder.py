@@ -28,8 +28,6 @@ Transform = Callable[[SampleDict], Sample]
 """A function that data sets apply to each sample."""
 _MAX_PROSE_BYTES = 1 << 16
 """Maximum size of a text file that is read to see whether it contains points."""
-ANNOTATIONS = "Annotations"
-"""Folder of the objects of a room of S3DIS."""
 _LINKS = "links to files that were already read, or to a parent folder"
 _THREE_NUMBERS = re.compile(r"^\W*([-+]?[\d.][^\s,;]*[\s,;]+){2}[-+]?[\d.]", re.MULTILINE)
 """Beginning of a line of points."""
@@ -209,10 +207,10 @@ class FolderOfClouds(SceneDataset):
             if path.is_dir() or path.suffix.lower() in endings
             if not _is_matched(path.relative_to(self.root), exclude)
         ]
-        if any(path.parent.name == ANNOTATIONS for path in paths):
+        if any(path.parent.name == "Annotations" for path in paths):
             warn(
-                f"{root}: folders {ANNOTATIONS} contain parts of rooms of S3DIS; use torchrg "
-                "convert s3dis or torchrg.datasets.S3DIS."
+                f"{root}: folders Annotations contain parts of rooms of S3DIS; use torchrg convert "
+                "s3dis or torchrg.datasets.S3DIS."
             )
         for path in paths:
             if path.suffix == ".npy" and path.stem in POINT_ARRAYS:

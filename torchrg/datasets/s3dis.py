@@ -20,14 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrg._optional import require
-from torchrg.datasets.folder import (
-    ANNOTATIONS,
-    SceneDataset,
-    SceneFiles,
-    Transform,
-    check_folder,
-    list_dir,
-)
+from torchrg.datasets.folder import SceneDataset, SceneFiles, Transform, check_folder, list_dir
 from torchrg.errors import ConfigError, FormatError, warn
 from torchrg.io import estimate_points
 from torchrg.io.arrow import parse_numbers
@@ -49,6 +42,7 @@ CLASS_ORDERS: dict[str, tuple[str, ...]] = {
 and writes, and in the order of Superpoint Transformer and KPConv."""
 ROOMS_PER_AREA = {1: 44, 2: 40, 3: 23, 4: 49, 5: 68, 6: 48}
 """Number of rooms per area in the release, 272 in all."""
+ANNOTATIONS = "Annotations"
 _OBJECT = re.compile(r"([A-Za-z]+)_([0-9]+)(?: \(([0-9]+)\))?")
 """Names of object files and their copies."""
 _NUM_COLUMNS = 6

@@ -15,7 +15,7 @@ from torchrg.errors import FormatError
 from torchrg.io.columns import check_field
 from torchrg.io.e57 import count_e57, read_e57
 from torchrg.io.fields import add_result_fields, convert_coordinates
-from torchrg.io.files import ARCHIVE_ERRORS, check_file, check_writable, local_path, wrap_errors
+from torchrg.io.files import ARCHIVE_ERRORS, check_file, check_writable, local_path
 from torchrg.io.las import check_las, count_las, read_las, write_las
 from torchrg.io.npy import count_npy, count_npz, read_npy, read_npz, write_npy, write_npz
 from torchrg.io.pcd import count_pcd, read_pcd, write_pcd
@@ -85,17 +85,14 @@ _SIGNATURES = {
     b"\x93NUMPY": ".npy",
     b"LASF": ".las or .laz",
     b"ASTM-E57": ".e57",
-    b"ply\n": ".ply",
-    b"ply\r": ".ply",
+    b"ply": ".ply",
     b"# .PCD": ".pcd",
 }
 """Suffixes of files by their first bytes."""
 TEXT_SUFFIXES = tuple(kind for kind, form in FORMATS.items() if form.read is read_text)
 """Suffixes of text files."""
-_COMPRESSED_SUFFIXES = (".npz", ".laz", ".pcd", ".e57")
-"""Suffixes of files that may be compressed. In other files a point takes at least a byte."""
-_MAX_POINTS_PER_BYTE = 1032
-"""Maximum number of points per byte of compressed files: the maximum ratio of deflate."""
+_MAX_POINTS_PER_BYTE = dict.fromkeys((".npz", ".laz", ".pcd", ".e57"), 1032)
+"""Maximum number of points per byte of a file that may be compressed, by deflate; others have 1."""
 _PLANES_SUFFIX = ".vg"
 """Suffix of vertex groups, which are write-only and store coordinates, colors and planes."""
 
@@ -136,13 +133,13 @@ def read_cloud(path: FilePath, *, columns: Sequence[str] | None = None) -> Cloud
     """
     source = local_path(path)
     size, fmt = check_file(source), _get_format(source)
-    _check_signature(source)
     if columns is not None and not takes_columns(source):
         raise FormatError(f"{source}: column names apply to text and .npy files only; omit them.")
     names = () if columns is None else (columns,)
     try:
         # Arbitrary bit patterns may overflow or signal; keep them without a warning.
         with np.errstate(over="ignore", invalid="ignore"):
+            _check_signature(source)
             return fmt.read(source, size, *names)
     except OSError as error:
         raise FormatError(f"{source}: cannot be read: {error.strerror or error}.") from error
@@ -258,7 +255,7 @@ def estimate_points(path: Path) -> int:
     Returns 0 for an unknown format or a corrupt file, such as one that is too small for its number
     of points; reading reports them.
     """
-    limit = _MAX_POINTS_PER_BYTE if path.suffix.lower() in _COMPRESSED_SUFFIXES else 1
+    limit = _MAX_POINTS_PER_BYTE.get(path.suffix.lower(), 1)
     try:
         size = check_file(path)
         count = _get_format(path).count(path, size)
@@ -284,7 +281,7 @@ def _get_format(path: Path, other: str = "", *, for_writing: bool = False) -> Fo
 
 def _check_signature(path: Path) -> None:
     """Raise FormatError if the first bytes of a file are those of another format."""
-    with wrap_errors(f"{path}: cannot be read: ", OSError), path.open("rb") as stream:
+    with path.open("rb") as stream:
         start = stream.read(max(map(len, _SIGNATURES)))
     kinds = next((kinds for first, kinds in _SIGNATURES.items() if start.startswith(first)), "")
     if kinds and path.suffix.lower() not in kinds.split(" or "):

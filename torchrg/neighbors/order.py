@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrg import kernels
 from torchrg._checks import as_tensor, check_points
 from torchrg._parallel import ROWS_AT_ONCE, nonzero_rows, split_rows
+from torchrg.errors import CloudWarning, warn
 from torchrg.structures import UNLABELED, AnyCloud
 from torchrg.structures.points import bounding_box, short_repr
 
@@ -113,7 +114,7 @@ def distinct_points(points: AnyCloud, ties: Sequence[Tensor] = ()) -> DistinctPo
 
     Duplicates would displace other points in a neighborhood, so neighbors are searched among
     distinct points. The representative has the smallest ``ties``, columns ``(N,)``, or is the
-    first.
+    first. Warn if no point is finite.
 
     Example:
         >>> cloud = torch.tensor([[2.0, 0, 0], [1, 0, 0], [2, 0, 0], [torch.nan, 0, 0]])
@@ -123,6 +124,8 @@ def distinct_points(points: AnyCloud, ties: Sequence[Tensor] = ()) -> DistinctPo
     """
     points = as_tensor("distinct_points", "points", points)
     rows = finite_rows(points, ties)
+    if len(rows) == 0 < len(points):
+        warn(f"expected finite points, got none of {len(points):,}; check them.", CloudWarning)
     # Three times faster than indexing.
     ordered = points.index_select(0, rows)
     is_first = mark_distinct(*ordered.detach().unbind(dim=1))

@@ -86,16 +86,11 @@ def sample_voxels(points: AnyCloud, size: float) -> Voxels:
 
 def warn_about_voxel(caller: str, size: float, num_voxels: int, num_points: int) -> None:
     """Warn if a voxel size leaves all points, or too few for a plane: it may be in another unit."""
-    result = ""
-    if num_voxels < _MIN_VOXELS <= num_points:
-        result = f"{num_voxels:,} of {num_points:,} points"
-    elif num_voxels == num_points > 0:
-        result = f"all {num_points:,} points"
-    if result:
-        warn(
-            f"{caller}: voxel {size:g} leaves {result}; check that it is in units of the cloud.",
-            CloudWarning,
-        )
+    is_all = num_voxels == num_points > 0
+    if is_all or num_voxels < _MIN_VOXELS <= num_points:
+        left = f"{'all' if is_all else f'{num_voxels:,} of'} {num_points:,} points"
+        repair = "check that it is in units of the cloud"
+        warn(f"{caller}: voxel {size:g} leaves {left}; {repair}.", CloudWarning)
 
 
 def _first_by_coordinates(chosen: Tensor, voxel: Tensor, columns: Sequence[Tensor]) -> Tensor:

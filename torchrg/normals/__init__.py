@@ -34,12 +34,7 @@ from torchrg.config import AnyConfig, NormalsConfig, settings_of
 from torchrg.errors import ConfigError
 from torchrg.neighbors import distinct_points
 from torchrg.neighbors.knn import check_neighbors, search_distinct
-from torchrg.normals.estimators import (
-    ESTIMATORS,
-    WITHOUT_GRADIENT,
-    check_num_neighbors,
-    run_estimator,
-)
+from torchrg.normals.estimators import ESTIMATORS, WITHOUT_GRADIENT, run_estimator
 from torchrg.normals.irls import fit_normals_irls
 from torchrg.normals.jet import JetFit, fit_jet, fit_normals_jet
 from torchrg.normals.orient import (
@@ -154,7 +149,7 @@ def estimate_normals(
         sites, near, restore = tensor, neighbors, _unchanged
     else:
         distinct = distinct_points(tensor)
-        check_num_neighbors("estimate_normals", settings, len(distinct.points))
+        settings.check_num_points("estimate_normals", len(distinct.points))
         search = neighbors or partial(search_distinct, max_distance=max_distance)
         sites, restore = distinct.points, distinct.restore
         near = search(sites, settings.k)

@@ -6,8 +6,6 @@ from torch import Tensor
 
 from torchrg._parallel import limit_rows
 from torchrg.config import NormalsConfig
-from torchrg.errors import ConfigError
-from torchrg.kernels import MAX_NEIGHBORS
 from torchrg.linalg.precision import to_single
 from torchrg.normals.consensus import estimate_consensus
 from torchrg.normals.irls import estimate_irls
@@ -38,20 +36,6 @@ ESTIMATORS: dict[str, Estimator] = {
 """Estimators by name: points, neighbors, configuration, chunk size -> fit."""
 WITHOUT_GRADIENT = {"consensus"}
 """Estimators without gradients, because they select and smooth planes in several steps."""
-
-
-def check_num_neighbors(caller: str, config: NormalsConfig, num_points: int) -> None:
-    """Raise ConfigError if neighborhoods beyond the kernels hold over half of the distinct points.
-
-    Small clouds use all of their points up to the maximum of the kernels.
-    """
-    limit = max(num_points // 2, MAX_NEIGHBORS)
-    for name, k in (("normals.k", config.k), ("normals.adaptive_k", config.adaptive_k or 0)):
-        if k > limit:
-            raise ConfigError(
-                f"{caller}: expected {name} of at most {limit:,} for {num_points:,} distinct "
-                f"points, got {k:,}; lower it, as 50 suits most clouds."
-            )
 
 
 def run_estimator(

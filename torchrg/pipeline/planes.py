@@ -25,7 +25,7 @@ from torchrg.neighbors import (
 from torchrg.neighbors.knn import restrict_to_groups, search_distinct
 from torchrg.neighbors.order import DistinctPoints
 from torchrg.neighbors.voxels import warn_about_voxel
-from torchrg.normals.estimators import check_num_neighbors, run_estimator
+from torchrg.normals.estimators import run_estimator
 from torchrg.normals.orient import Orientation, choose_side, find_directions, turn_faces
 from torchrg.regions import grow_regions, summarize_planes
 from torchrg.regions.classes import find_kinds
@@ -174,7 +174,7 @@ def _segment(
     distinct = DistinctPoints(*map(scratch.store, distinct_points(points)))
     sites = _find_sites(distinct, voxel)
     num_sites, k = len(sites.points), config.normals.k
-    check_num_neighbors("segment_planes", config.normals, num_sites)
+    config.normals.check_num_points("segment_planes", num_sites)
     if num_sites < _MIN_NEIGHBORHOODS * k and (voxel is not None or min(num_sites, k) > 2):
         warn(
             f"segment_planes: expected at least {_MIN_NEIGHBORHOODS * k:,} distinct points for "

@@ -281,9 +281,6 @@ def fuse_depth(samples: Iterable[Entries], *, voxel_size: float | None = None) -
 
     Raises:
         ConfigError: If there is no sample, one lacks a pose, or ``voxel_size`` is not positive.
-
-    Warns:
-        CloudWarning: If ``voxel_size`` leaves all points or fewer than three.
         ShapeError: If a shape is not as above.
 
     Example:
