@@ -1,12 +1,15 @@
 """Flags of settings, names of columns and cameras."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.cli.test_cli import CLASSIC, config_of
 from tests.cli.test_depth import INTRINSICS
+from torchrg.cli import segment
+from torchrg.cli.arguments import parse
 from torchrg.cli.flags import (
     describe_sampling,
     parse_intrinsics,
@@ -161,9 +164,16 @@ def test_split_columns_by_example():
         ("segment a.ply --out b.npz --nb-neighbors 30", "Did you mean --normals.k?"),
         ("segment a.ply --out b.npz --unit m", "--unit: lengths are in the unit of the cloud"),
         ("segment a.ply --out b.npz --crs 25832", "--crs: coordinates keep their reference system"),
-        ("segment a.ply --kinds wall floor --out b.npz", "a.ply: file not found"),
         ("sample a.ply -n 5000", "option -n. Did you mean --num-points?"),
     ],
 )
 def test_words_of_other_programs_have_advice(words, message, run):
     assert message in run(*words.split()).error
+
+
+@pytest.mark.parametrize("kinds", [("wall,floor",), ("wall", "floor"), ("wall", "--kinds=floor")])
+def test_kinds_are_separated_by_commas_or_spaces(kinds):
+    words = ["a.ply", "--out", "b.npz", "--kinds", *kinds]
+    parsed = parse(segment.Arguments, words, prog="torchrg segment")
+    assert parsed.settings.kinds == ("wall", "floor")
+    assert parsed.inputs == (Path("a.ply"),)
