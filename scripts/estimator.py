@@ -4,6 +4,7 @@ import importlib
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor
 
@@ -21,6 +22,11 @@ def load_estimator(target: str) -> Estimator:
         SystemExit: If there is no such function.
     """
     module, _, name = target.partition(":")
+    if not name:
+        raise SystemExit(
+            f"--estimator: expected module:function, got {target}; add the function, as in "
+            f"{target.removesuffix(':')}:estimate."
+        )
     sys.path.insert(0, str(Path.cwd()))
     try:
         function: Estimator = getattr(importlib.import_module(module), name)
@@ -31,13 +37,15 @@ def load_estimator(target: str) -> Estimator:
         ) from None
 
     def estimate(points: Tensor) -> tuple[Tensor, Tensor]:
-        normals, curvature = function(points)
-        shapes = tuple(normals.shape), tuple(curvature.shape)
-        if shapes != (tuple(points.shape), tuple(points.shape[:1])):
+        results: Any = function(points)
+        values = results if isinstance(results, tuple | list) else [results]
+        expected = [tuple(points.shape), tuple(points.shape[:1])]
+        got = [tuple(v.shape) if isinstance(v, Tensor) else type(v).__name__ for v in values]
+        if got != expected:
             raise SystemExit(
-                f"--estimator: expected normals {tuple(points.shape)} and curvature "
-                f"{tuple(points.shape[:1])} from {target}, got {shapes[0]} and {shapes[1]}."
+                f"--estimator: expected normals {expected[0]} and curvature {expected[1]} from "
+                f"{target}, got {' and '.join(map(str, got))}; return both, as tensors."
             )
-        return normals, curvature
+        return values[0], values[1]
 
     return estimate

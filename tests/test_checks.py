@@ -36,6 +36,22 @@ def test_missing_axes_are_refused():
         check_shapes("f", points=(torch.zeros(3), "N 3"))
 
 
+@pytest.mark.parametrize(
+    ("shape", "pattern", "repair"),
+    [
+        ((50,), "* K P", "x[:, None]"),
+        ((3,), "N 3", "x[None]"),
+        ((2, 5, 3), "N 3", "one part, as x[0] or x[..., 0]"),
+        ((1, 8, 9), "H W", "one part, as x[0] or x[..., 0]"),
+        ((8, 9, 3), "H W", "x, not colors"),
+    ],
+)
+def test_an_axis_too_many_or_too_few_is_refused_with_the_repair(shape, pattern, repair):
+    with pytest.raises(ShapeError) as refused:
+        check_shapes("f", x=(torch.zeros(shape), pattern))
+    assert str(refused.value).endswith(f", got {shape}; pass {repair}.")
+
+
 def test_tensors_of_two_devices_are_refused_with_both_names():
     meta = torch.zeros(4, 3, device="meta")
     with pytest.raises(ShapeError, match=r"^f: expected x and y on one device, got cpu and meta;"):

@@ -270,6 +270,7 @@ def test_results_in_other_places_are_refused_with_the_repair(tmp_path):
         (lambda: torchrg.nn.DetMCD(points), r"use DetMCD\(\)\(tensor\)"),
         (lambda: torchrg.segment_planes(points, voxel="2cm"), "expected size > 0, got '2cm'"),
         (lambda: torchrg.estimate_normals(points, "pca"), "an estimator is a method, as method='p"),
+        (lambda: torchrg.segment_planes(points, normals=points), "torchrg.grow_regions takes nor"),
     ]:
         with pytest.raises(ConfigError, match=message):
             call()
@@ -277,7 +278,40 @@ def test_results_in_other_places_are_refused_with_the_repair(tmp_path):
         torchrg.segment_planes(points.int())
     with pytest.raises(ShapeError, match=r"got tuple; use torchrg.depth.make_intrinsics\(fx"):
         torchrg.depth.segment_depth(torch.ones(4, 5), (5, 5, 2, 2))
+    neighbors = torchrg.search_knn(points, 10)
+    with pytest.raises(ShapeError, match=r"got Neighbors; pass curvature in its place, or name"):
+        torchrg.grow_regions(points, seg.normals, neighbors, "classic")
+    with pytest.raises(ShapeError, match=r"pass the cloud .*torchrg.write_cloud\(path, cloud, seg"):
+        torchrg.write_cloud(tmp_path / "a.ply", seg)
     with pytest.raises(ShapeError, match="got Segmentation; pass its labels"):
         torchrg.metrics.score_labels(seg, seg.labels)
     with pytest.raises(ShapeError, match="got str; pass its values, not a name or path"):
         torchrg.segment_planes(points, within="instance")
+
+
+@pytest.mark.parametrize("make", [torch.asarray, np.asarray], ids=["tensor", "array"])
+def test_no_message_lists_the_values_of_a_tensor(make):
+    points = argument("planes")
+    wrong = make(points.numpy())
+    for name in ("config", "orient", "voxel", "min_area", "normals", "kinds", "up", "normals.k"):
+        with pytest.raises(ConfigError, match=f"{type(wrong).__name__}") as refused:
+            torchrg.segment_planes(points, **{name: wrong})
+        assert "\n" not in str(refused.value)
+        assert len(str(refused.value)) < 250
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        torchrg.nn.DetMCD,
+        lambda **settings: torchrg.robust.fit_detmcd(argument("planes"), **settings),
+    ],
+    ids=["module", "function"],
+)
+def test_unknown_keywords_of_estimators_lead_to_those_here(call):
+    with pytest.raises(
+        TypeError, match="unexpected keyword argument 'alpha'; use support_fraction"
+    ):
+        call(alpha=0.75)
+    with pytest.raises(TypeError, match=r"'wild'; it has .*support_fraction, quantile"):
+        call(wild=1)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchrg._parallel import sequential_operations
-from torchrg.errors import ConfigError, ShapeError
+from torchrg.errors import ConfigError, ShapeError, shown
 from torchrg.structures import AnyCloud, Cloud
 from torchrg.structures.points import Points
 
@@ -38,8 +38,10 @@ def as_tensor(caller: str, name: str, values: Any) -> Tensor:  # noqa: ANN401
         return torch.from_numpy(np.require(native, requirements=["C", "W"]))
     expected = "a tensor or a NumPy array" + (", a Cloud or a path" if name in _POINTS else "")
     kind = f"array of {values.dtype}" if isinstance(values, np.ndarray) else type(values).__name__
-    fix = _repair(caller, name, values)
-    raise ShapeError(f"{caller}: expected {name} to be {expected}, got {kind}{fix}.")
+    from torchrg._synonyms import repair_of
+
+    kind += repair_of(caller, name, values)
+    raise ShapeError(f"{caller}: expected {name} to be {expected}, got {kind}.")
 
 
 def as_cloud(points: AnyCloud) -> Points | Cloud:
@@ -60,31 +62,12 @@ def to_cloud(caller: str, cloud: AnyCloud) -> Cloud:
     return Cloud(points.numpy(force=True))
 
 
-def _repair(caller: str, name: str, values: object) -> str:
-    """Return how to make a tensor of an object of another type, after a semicolon, or ""."""
-    if type(values).__module__.startswith("open3d"):
-        return "; pass numpy.asarray(cloud.points)"
-    if has := [key for key in (name, "points", "labels") if hasattr(values, key)]:
-        return f"; pass its {has[0]}"
-    if name == "intrinsics":
-        return "; use torchrg.depth.make_intrinsics(fx, fy, cx, cy)"
-    if isinstance(values, str):
-        return "; pass its values, not a name or path"
-    if isinstance(values, list | tuple) and values and getattr(values[0], "ndim", 0) > 1:
-        return f"; pass one at a time, as [{caller}(p) for p in {name}]"
-    if isinstance(values, list | tuple):
-        return "; use torch.tensor, or with_format('torch') for a data set"
-    if hasattr(values, "to_numpy"):
-        return "; pass its columns of coordinates, as in frame[['x', 'y', 'z']].to_numpy()"
-    return ""
-
-
 def check_choices(caller: str, **arguments: tuple[str, Any]) -> None:
     """Check that settings are among the choices of types, as in ``x=(x, Literal["a", "b"])``."""
     for name, (value, kind) in arguments.items():
-        if value not in get_args(kind):
-            choices = ", ".join(get_args(kind))
-            raise ConfigError(f"{caller}: expected {name} to be one of {choices}, got {value!r}.")
+        if getattr(value, "ndim", 0) or value not in get_args(kind):
+            choices = f"{', '.join(get_args(kind))}, got {shown(value)}"
+            raise ConfigError(f"{caller}: expected {name} to be one of {choices}.")
 
 
 def check_kinds(caller: str, repair: str, **arguments: tuple[object, Any]) -> None:
@@ -170,7 +153,10 @@ def check_shapes(caller: str, **arguments: tuple[Tensor | None, str]) -> None:
         if not _bind(shape, pattern.split(), bound):
             fixed = ", ".join(f"{k}={v if k == '*' else v[0]}" for k, v in sizes.items())
             expected = f"({', '.join(pattern.split())})" + (f" with {fixed}" if fixed else "")
-            raise ShapeError(f"{caller}: expected {name} of shape {expected}, got {shape}.")
+            from torchrg._synonyms import repair_shape
+
+            fix = repair_shape(name, shape, pattern.split())
+            raise ShapeError(f"{caller}: expected {name} of shape {expected}, got {shape}{fix}.")
         first = first or (name, tensor)
         if tensor.device != first[1].device:
             raise ShapeError(

@@ -56,6 +56,11 @@ def opaque(
 
         @wraps(function)
         def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Returned:
+            for key in kwargs:
+                if key not in parameters:
+                    from torchrg._synonyms import describe_keyword
+
+                    raise TypeError(f"{name}() {describe_keyword(key, parameters)}")
             # Compilers of torch 2.5 support neither a zip of unequal lengths nor a union of dicts.
             arguments: dict[str, Any] = {parameters[i]: value for i, value in enumerate(args)}
             arguments = {**arguments, **kwargs}

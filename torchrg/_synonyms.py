@@ -1,7 +1,7 @@
-"""Suggestions for misspelled names, and for names of other libraries."""
+"""Repairs in messages: for misspelled names, names of other libraries, and other arguments."""
 
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 _MIN_SIMILARITY = 0.75
 """Similarity to a misspelled name from which a name is suggested, as in difflib."""
@@ -32,6 +32,7 @@ _SYNONYMS = {
     "out": _OUTPUT,
     "picture": "image plot render visualize",
     "seed": _SEED,
+    "support_fraction": "alpha",
     "table": "csv",
     "threads": _THREADS,
     "up": "up_axis vertical_axis",
@@ -61,6 +62,7 @@ _ADVICE = {
     "batches with an offset are supported by torchrg.transforms": "offset",
     "commands name OUT or --out, and torchrg.write_cloud writes a result": f"out {_OUTPUT}",
     "pass the preset as the first argument, config, or as the key base": "preset",
+    "torchrg.grow_regions takes normals of points": "normals",
     "neighborhoods have k points; max_distance bounds their radius": "radius",
     "leave it out: the default adapts to the data; up sets the up axis": "laser rgbd s3dis scannet",
     "torch.set_num_threads sets the number of threads": f"threads workers {_THREADS}",
@@ -157,3 +159,45 @@ def advice_on(word: str) -> str:
     """Return how to do without a name of other libraries, or ""."""
     last = word.rpartition(".")[2]
     return next((advice for advice, words in _ADVICE.items() if last in words.split()), "")
+
+
+def describe_keyword(name: str, known: Sequence[str]) -> str:
+    """Return the message about a keyword that a function lacks, with what to use."""
+    nearest = nearest_name(name, known)
+    use = f"use {nearest}" if nearest else advice_on(name) or f"it has {', '.join(known)}"
+    return f"got an unexpected keyword argument {name!r}; {use}."
+
+
+def repair_of(caller: str, name: str, values: object) -> str:
+    """Return how to make a tensor of an object of another type, after a semicolon, or ""."""
+    if type(values).__module__.startswith("open3d"):
+        return "; pass numpy.asarray(cloud.points)"
+    if name == "cloud" and hasattr(values, "labels") and not hasattr(values, "cloud"):
+        return "; pass the cloud that was segmented, as in torchrg.write_cloud(path, cloud, seg)"
+    if has := [key for key in (name, "points", "labels") if hasattr(values, key)]:
+        return f"; pass its {has[0]}"
+    if hasattr(values, "_fields"):
+        return f"; pass {name} in its place, or name the arguments"
+    if name == "intrinsics":
+        return "; use torchrg.depth.make_intrinsics(fx, fy, cx, cy)"
+    if isinstance(values, str):
+        return "; pass its values, not a name or path"
+    if isinstance(values, list | tuple) and values and getattr(values[0], "ndim", 0) > 1:
+        return f"; pass one at a time, as [{caller}(p) for p in {name}]"
+    if isinstance(values, list | tuple):
+        return "; use torch.tensor, or with_format('torch') for a data set"
+    if hasattr(values, "to_numpy"):
+        return "; pass its columns of coordinates, as in frame[['x', 'y', 'z']].to_numpy()"
+    return ""
+
+
+def repair_shape(name: str, shape: tuple[int, ...], axes: list[str]) -> str:
+    """Return how to select from a tensor of one axis too many, or to add the missing one, or ""."""
+    missing = len(axes) - (axes[0] == "*") - len(shape)
+    if missing == -1 and axes == ["H", "W"] and shape[-1] in (3, 4):
+        return f"; pass {name}, not colors"
+    if missing == -1 and axes[0] != "*":
+        return f"; pass one part, as {name}[0] or {name}[..., 0]"
+    if missing == 1:
+        return f"; pass {name}[{'None' if axes[-1] == str(shape[-1]) else ':, None'}]"
+    return ""

@@ -20,7 +20,7 @@ from typing import Any, Literal, NoReturn, TypeVar
 import torch
 
 from torchrg._parallel import CHUNK_SIZE
-from torchrg.errors import ConfigError, warn
+from torchrg.errors import ConfigError, shown, warn
 from torchrg.kernels import MAX_NEIGHBORS
 from torchrg.structures import FARTHEST, PLANE_KINDS, PlaneKind, Sampling
 
@@ -430,7 +430,7 @@ class PipelineConfig(SelectionConfig):
         """
         angle_deg = convert(angle_deg, float, "angle_deg", "PipelineConfig")
         if not 0 <= angle_deg <= 90:
-            raise SettingError("PipelineConfig", "angle_deg", f"in [0, 90], got {angle_deg!r}")
+            raise SettingError("PipelineConfig", "angle_deg", f"in [0, 90], got {shown(angle_deg)}")
         parts = {
             section: dataclasses.replace(getattr(self, section), **{name: angle_deg})
             for section, name in _ANGLES.items()
@@ -680,7 +680,7 @@ def _preset_file(name: object, *, expected: str) -> Path:
         from torchrg._synonyms import advice_on
 
         advice = advice_on(str(name)) and f"; {advice_on(str(name))}"
-        raise ConfigError(f"{expected} {', '.join(preset_names())}, got {name!r}{advice}.")
+        raise ConfigError(f"{expected} {', '.join(preset_names())}, got {shown(name)}{advice}.")
     return _preset_folder() / f"{name}.yaml"
 
 
@@ -723,7 +723,7 @@ def _fix_for(key: str, value: object, config: object, prefix: str) -> str:
 
     names = [*vars(config), *["angle_deg"] * isinstance(config, PipelineConfig)]
     if name := nearest_name(key, [*names, *(name for name, _ in _flat_values(config))]):
-        return f"the nearest is {prefix}{name}, as in {{{f'{prefix}{name}'!r}: {value!r}}}"
+        return f"the nearest is {prefix}{name}, as in {{{f'{prefix}{name}'!r}: {shown(value)}}}"
     return advice_on(key) or f"{type(config).__name__} has {', '.join(names)}"
 
 
@@ -769,7 +769,7 @@ class SettingError(ConfigError):
 def expect(config: object, name: str, requirement: str, holds: bool) -> None:
     """Raise if a setting does not meet a requirement."""
     if not holds:
-        problem = f"{requirement}, got {getattr(config, name)!r}"
+        problem = f"{requirement}, got {shown(getattr(config, name))}"
         raise SettingError(type(config).__name__, name, problem)
 
 
@@ -787,8 +787,11 @@ def convert(value: Any, hint: Any, name: str, where: str = "") -> Any:  # noqa: 
     for kind in sorted(kinds, key=lambda kind: kind is not NoneType):
         with suppress(ValueError, OverflowError):
             return _convert_to(kind, plain)
+    from torchrg._synonyms import advice_on
+
     expected = " or ".join(map(_type_name, kinds))
-    raise SettingError(where, name, f"to be {expected}, got {value!r}")
+    advice = advice_on(name) and f"; {advice_on(name)}" if dataclasses.is_dataclass(hint) else ""
+    raise SettingError(where, name, f"to be {expected}, got {shown(value)}{advice}")
 
 
 def _convert_to(kind: Any, value: Any) -> Any:  # noqa: ANN401

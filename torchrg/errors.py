@@ -56,8 +56,18 @@ class DepthWarning(UserWarning):
     """A camera or depth scale is assumed, or does not fit its depth image."""
 
 
+MAX_SHOWN = 100
+"""Maximum length of a value in a message or a result that prints, in characters."""
 _LIBRARIES = {"torchrg", "torch", "contextlib", "functools"}
 """Packages between a warning and the code of the user: decorators and ``nn.Module`` calls."""
+
+
+def shown(value: object) -> str:
+    """Return a value as text for a message: tensors and arrays by shape, other long values cut."""
+    if getattr(value, "ndim", 0):
+        return f"{type(value).__name__} of shape {tuple(getattr(value, 'shape', ()))}"
+    text = repr(value)
+    return text if len(text) <= MAX_SHOWN else f"{text[: MAX_SHOWN - 3]}..."
 
 
 def warn(message: str, category: type[Warning] = UserWarning) -> None:

@@ -18,7 +18,7 @@ describes the majority, even on a line; normals need planes: pass ``min_dimensio
 """
 
 from collections.abc import Callable
-from dataclasses import KW_ONLY, asdict, dataclass
+from dataclasses import KW_ONLY, asdict, dataclass, fields
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, NamedTuple, TypeVar
 
@@ -61,17 +61,23 @@ class _Function(nn.Module, Generic[Result]):
 
         def __call__(self, *tensors: object, **options: object) -> Result: ...
 
+    def __new__(cls, *values: object, **settings: object) -> Any:  # noqa: ANN401
+        """Initialize the module; refuse other keywords, and tensors in place of settings."""
+        names = [field.name for field in fields(cls)]
+        for unknown in settings.keys() - names:
+            from torchrg._synonyms import describe_keyword
+
+            raise TypeError(f"{cls.__name__}() {describe_keyword(unknown, names)}")
+        if any(isinstance(value, Tensor) for value in (*values, *settings.values())):
+            name = cls.__name__
+            raise ConfigError(f"{name}: expected settings, got a tensor; use {name}()(tensor).")
+        module = super().__new__(cls)
+        nn.Module.__init__(module)
+        return module
+
     def __post_init__(self) -> None:
-        self._initialize()
         # A call without patches validates the settings.
         self(torch.empty(0, 4, 3))
-
-    def _initialize(self) -> None:
-        """Initialize the module; raise if tensors are passed in place of settings."""
-        super().__init__()
-        if any(isinstance(value, Tensor) for value in asdict(self).values()):
-            name = type(self).__name__
-            raise ConfigError(f"{name}: expected settings, got a tensor; use {name}()(tensor).")
 
     def extra_repr(self) -> str:
         """Return the settings as text."""
@@ -159,7 +165,6 @@ class Qn(_Function[Tensor]):
     finite_sample: bool = False
 
     def __post_init__(self) -> None:
-        self._initialize()
         if type(self.dim) is not int:
             raise ConfigError(f"Qn: expected dim to be an integer, got {self.dim!r}.")
 

@@ -125,6 +125,9 @@ def estimate(points):
 
 def estimate_one(points):
     return points[0], points[:, 0]
+
+def only_normals(points):
+    return points
 """
 
 
@@ -137,6 +140,13 @@ def test_an_estimator_of_ones_own_is_scored_as_ours(tmp_path, monkeypatch):
     case = accuracy.Case(**only, estimator="own_estimator:estimate_one")
     with pytest.raises(SystemExit, match=r"expected normals \(1200, 3\) .* got \(3,\) and"):
         harness.measure(case)
+    case = accuracy.Case(**only, estimator="own_estimator:only_normals")
+    with pytest.raises(
+        SystemExit, match=r"from own_estimator:only_normals, got \(1200, 3\); return"
+    ):
+        harness.measure(case)
+    with pytest.raises(SystemExit, match="got own_estimator; add the function, as in own_esti"):
+        accuracy.Case(estimator="own_estimator").contenders()
     with pytest.raises(SystemExit, match="expected module:function, got own_estimator:nothing"):
         accuracy.Case(estimator="own_estimator:nothing").contenders()
 

@@ -62,7 +62,9 @@ def test_a_table_is_gone_through_plane_by_plane():
             assert torch.equal(torch.as_tensor(one, dtype=column.dtype), column)
     assert planes[-1].id == len(planes) - 1
     assert planes[torch.tensor(2)].id == 2
-    with pytest.raises(IndexError, match=f"expected a row below {len(planes)}, got 99"):
+    with pytest.raises(
+        IndexError, match=rf"expected a row in \[-{len(planes)}, {len(planes)}\), got 99"
+    ):
         planes[99]
     assert [plane.id for plane in planes[:3]] == [0, 1, 2]
     assert [plane.id for plane in planes[-2:]] == [len(planes) - 2, len(planes) - 1]
@@ -100,9 +102,22 @@ def test_equations_and_inliers_are_those_of_open3d(seg):
     image = segment_depth(
         torch.full((30, 40), 2.0), torch.tensor([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]])
     )
-    assert len(image.inliers(-1)) == 1200
-    with pytest.raises(IndexError, match="inliers: expected a row below 1, got 3"):
+    assert len(image.inliers(0)) == 1200
+    with pytest.raises(IndexError, match=r"inliers: expected a row in \[0, 1\), got 3\."):
         seg.inliers(3)
+    with pytest.raises(IndexError, match=r"got -1; points of no plane are those of seg.labels =="):
+        seg.inliers(-1)
+
+
+def test_items_of_results_are_attributes(seg):
+    for owner, name in [(seg, "labels"), (seg.planes[0], "normal")]:
+        with pytest.raises(TypeError, match=rf"not items, got \['{name}'\]; use {name}\."):
+            owner[name]
+    cloud = torchrg.Cloud(np.zeros((3, 3)), {"intensity": np.zeros(3)})
+    with pytest.raises(TypeError, match=r"use fields\['intensity'\]\."):
+        cloud["intensity"]
+    with pytest.raises(TypeError, match=r"got \[Tensor of shape \(3,\)\]; use its attributes\."):
+        cloud[torch.ones(3).bool()]
 
 
 def test_a_segmentation_goes_to_a_device_whole():

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg.errors import ConfigError
+from torchrg.errors import ConfigError, shown
 
 _ASIN_DEGREE = 10
 
@@ -32,7 +32,7 @@ def unit_direction(caller: str, up: Sequence[float] | str) -> Tensor:
     if direction.shape != (3,) or not bool(direction.isfinite().all() and direction.any()):
         raise ConfigError(
             f"{caller}: expected up to be a direction (three numbers, not all zero, or the name of "
-            f"an axis), got {up!r}."
+            f"an axis), got {shown(up)}."
         )
     direction /= direction.abs().amax()
     direction /= direction.norm()

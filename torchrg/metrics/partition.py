@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg._checks import as_tensor, check_floating, check_shapes, is_positive
-from torchrg.errors import ConfigError
+from torchrg.errors import ConfigError, shown
 from torchrg.metrics.contingency import (
     check_labels,
     contingency_table,
@@ -104,7 +104,7 @@ def score_partition(
     )
     if boundary_distance is not None and not is_positive(boundary_distance):
         raise ConfigError(
-            f"score_partition: expected boundary_distance > 0, got {boundary_distance!r}."
+            f"score_partition: expected boundary_distance > 0, got {shown(boundary_distance)}."
         )
     if points is not None:
         points = as_tensor("score_partition", "points", points)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchrg import scratch
 from torchrg._checks import as_tensor, check_points, is_positive
-from torchrg.errors import CloudWarning, ConfigError, warn
+from torchrg.errors import CloudWarning, ConfigError, shown, warn
 from torchrg.neighbors.order import mark_distinct
 from torchrg.structures import UNLABELED, AnyCloud
 from torchrg.structures.points import short_repr
@@ -53,7 +53,7 @@ def sample_voxels(points: AnyCloud, size: float) -> Voxels:
     tensor = as_tensor("sample_voxels", "points", points)
     check_points("sample_voxels", tensor)
     if not is_positive(size):
-        raise ConfigError(f"sample_voxels: expected size > 0, got {size!r}.")
+        raise ConfigError(f"sample_voxels: expected size > 0, got {shown(size)}.")
     inverse = torch.full((len(tensor),), UNLABELED, device=tensor.device)
     finite = tensor.isfinite().all(dim=-1).nonzero().squeeze(-1)
     if len(finite) == 0:
@@ -69,7 +69,7 @@ def sample_voxels(points: AnyCloud, size: float) -> Voxels:
     if max(float(cell.max()) for cell in cells) >= _MAX_VOXELS:
         raise ConfigError(
             f"sample_voxels: expected size to divide the extent of the cloud into fewer than 2^53 "
-            f"cells, got {size!r}. Choose a larger size."
+            f"cells, got {shown(size)}. Choose a larger size."
         )
     keys, order = map(scratch.store, cell_keys(cells).sort(stable=True))
     voxel, counts = torch.unique_consecutive(keys, return_inverse=True, return_counts=True)[1:]

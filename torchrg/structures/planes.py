@@ -180,7 +180,8 @@ class Planes(_Movable):
         curved: Mask of smooth but nonplanar regions (a column, a bent wall), shape ``(M,)``, bool.
         kind: Class of each plane as an index of :data:`PLANE_KINDS`, shape ``(M,)``, int64. Unless
             an up axis was set, :func:`torchrg.segment_planes` classifies on first access, with z
-            up. None for depth images with an unknown up axis.
+            up. Numbers equal no word: use ``torchrg.select_planes(seg, kinds="wall")``, or
+            ``plane.kind`` of each plane. None for depth images with an unknown up axis.
         outline: Polygon of each region as rings of shape ``(V, 3)``: seen against the normal, outer
             rings are counter-clockwise and holes clockwise; None if not requested.
         adjacency: Adjacent planes; None without neighbors.
@@ -239,7 +240,7 @@ class Planes(_Movable):
         """Return a plane by its row, or a list of the planes of a slice."""
         if isinstance(row, slice):
             return [self[index] for index in range(len(self))[row]]
-        row = _find_row("Planes", row, len(self))
+        row = _find_row("Planes", row, -len(self), len(self))
         columns = {name: getattr(self, name)[row] for name in PLANE_COLUMNS}
         values = {name: value if value.ndim else value.item() for name, value in columns.items()}
         kind = None if self.kind is None else PLANE_KINDS[int(self.kind[row])]
@@ -258,17 +259,19 @@ class Planes(_Movable):
         return as_frame(self)
 
 
-def _find_row(caller: str, row: SupportsIndex, num_planes: int) -> int:
+def _find_row(caller: str, row: SupportsIndex, lowest: int, num_planes: int) -> int:
     """Return the row of a plane, counted from the end if negative, or raise."""
     try:
-        return range(num_planes)[operator.index(row)]
+        index = operator.index(row)
     except TypeError:
         raise TypeError(
             f"{caller}: expected an integer row or a slice, got {type(row).__name__}; index "
             "columns with masks, as in planes.normal[planes.area > 1]; a plane has an id."
         ) from None
-    except IndexError:
-        raise IndexError(f"{caller}: expected a row below {num_planes}, got {row}.") from None
+    if not lowest <= index < num_planes:
+        fix = "; points of no plane are those of seg.labels == -1" * (index == -1)
+        raise IndexError(f"{caller}: expected a row in [{lowest}, {num_planes}), got {row}{fix}.")
+    return index % num_planes
 
 
 def _plural(count: int, noun: str) -> str:
@@ -335,8 +338,11 @@ class Segmentation(_Movable):
         return f"Segmentation({size}, {labeled:.1f} % labeled)"
 
     def inliers(self, plane: SupportsIndex) -> Tensor:
-        """Return the rows of the points of a plane (of flattened pixels), ``(n,)``, int64."""
-        row = _find_row("inliers", plane, len(self.planes))
+        """Return the rows of the points of a plane (of flattened pixels), ``(n,)``, int64.
+
+        ``plane`` is an ID from 0 to M-1. Others raise IndexError, and -1 too: it means no plane.
+        """
+        row = _find_row("inliers", plane, 0, len(self.planes))
         return (self.labels.flatten() == row).nonzero().squeeze(1)
 
     def show(self, **settings: Any) -> "Page":  # noqa: ANN401

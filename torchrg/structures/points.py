@@ -9,14 +9,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchrg.errors import MAX_SHOWN, shown
+
 UNLABELED = -1
 """Label of points without a region."""
 FARTHEST = 1e12
 """Maximum absolute coordinate; files use 1e20, 1e30 or the largest float32 for missing points."""
 MAX_POINTS = 2**31 - 1
 """Maximum number of points of a cloud; neighbor lists are int32."""
-_MAX_SHOWN = 100
-"""Maximum length of a value that a result prints, in characters."""
 Array = NDArray[Any]
 """Array of numbers or text of any shape."""
 Kind = TypeVar("Kind")
@@ -87,7 +87,7 @@ def _format(value: object) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
     text = "" if isinstance(value, Mapping) else repr(value)
-    return text if 0 < len(text) <= _MAX_SHOWN else f"a {type(value).__name__}"
+    return text if 0 < len(text) <= MAX_SHOWN else f"a {type(value).__name__}"
 
 
 class Explained:
@@ -108,7 +108,15 @@ def _raise_missing(owner: Explained, name: str) -> NoReturn:
     raise AttributeError(describe_missing(type(owner).__name__, name, known))
 
 
+def _raise_not_indexed(owner: Explained, key: object) -> NoReturn:
+    """Raise an error that names the attribute to use."""
+    known, name = owner._attributes(), type(owner).__name__  # noqa: SLF001 Part of this class.
+    use = known.get(key if isinstance(key, str) else "", "its attributes")
+    raise TypeError(f"{name} has attributes, not items, got [{shown(key)}]; use {use}.")
+
+
 Explained.__getattr__ = _raise_missing  # type: ignore[attr-defined]
+Explained.__getitem__ = _raise_not_indexed  # type: ignore[misc]
 
 
 @short_repr
