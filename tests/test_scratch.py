@@ -109,6 +109,7 @@ def test_voxels_and_superpoints_are_those_of_memory(tmp_path, small):
 
 
 @pytest.mark.parametrize("num_points", [0, 1, 2, 7])
+@pytest.mark.filterwarnings("ignore:expected finite points")
 def test_few_points_are_a_cloud_too(num_points, tmp_path, small):
     points = torch.full((num_points + 1, 3), torch.nan)
     points[1:] = torch.arange(3.0 * num_points).view(-1, 3) ** 2

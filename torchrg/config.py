@@ -21,7 +21,6 @@ import torch
 
 from torchrg._parallel import CHUNK_SIZE
 from torchrg.errors import ConfigError, shown, warn
-from torchrg.kernels import MAX_NEIGHBORS
 from torchrg.structures import FARTHEST, PLANE_KINDS, PlaneKind, Sampling
 
 __all__ = [
@@ -101,19 +100,6 @@ class NormalsConfig:
         expect(self, "support_fraction", "in [0.5, 1]", 0.5 <= self.support_fraction <= 1)
         expect(self, "inlier_quantile", "in (0, 1)", 0 < self.inlier_quantile < 1)
         expect(self, "irls_decay", "> 1", self.irls_decay > 1)
-
-    def check_num_points(self, caller: str, num_points: int) -> None:
-        """Raise ConfigError if neighborhoods beyond the kernels hold over half of distinct points.
-
-        Small clouds use all of their points up to the maximum of the kernels.
-        """
-        limit = max(num_points // 2, MAX_NEIGHBORS)
-        for name, k in (("k", self.k), ("adaptive_k", self.adaptive_k or 0)):
-            if k > limit:
-                raise ConfigError(
-                    f"{caller}: expected normals.{name} of at most {limit:,} for {num_points:,} "
-                    f"distinct points, got {k:,}; lower it, as 50 suits most clouds."
-                )
 
     def with_sampling(self, sampling: Sampling) -> "NormalsConfig":
         """Resolve ``auto`` values; see :meth:`PipelineConfig.with_sampling`."""

@@ -49,6 +49,7 @@ DATA ascii
 
 
 @pytest.mark.filterwarnings("ignore:.*expected .* rooms")
+@pytest.mark.filterwarnings("ignore:.*parts of rooms of S3DIS")
 def test_the_command_knows_every_kind_and_layout(tmp_path):
     assert {*get_args(get_type_hints(RGBDArguments)["layout"])} == {"auto", *FRAME_LAYOUTS}
     settings, camera = DepthConfig(), Pinhole(5.0, 5.0, 2.0, 1.0)

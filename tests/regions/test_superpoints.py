@@ -262,6 +262,7 @@ def test_a_picture_flush_with_a_wall_is_cut_out_by_its_colours():
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 5, 30])
+@pytest.mark.filterwarnings("ignore:expected finite points")
 def test_few_or_equal_points_are_one_superpoint(count):
     for points in (torch.ones(count, 3), torch.arange(3.0 * count).reshape(count, 3)):
         found = make_superpoints(points)

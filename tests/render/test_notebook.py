@@ -33,6 +33,7 @@ def test_without_points_there_is_no_picture(seg):
         replace(seg, points=None).show()
 
 
+@pytest.mark.filterwarnings("ignore:expected finite points")
 def test_a_cloud_without_planes_shows_itself():
     assert "0 planes" in torchrg.segment_planes(torch.full((5, 3), torch.nan))._repr_html_()
 

@@ -140,6 +140,20 @@ def _drop_far_neighbors(
     return is_near
 
 
+def check_num_neighbors(caller: str, num_points: int, **numbers: int | None) -> None:
+    """Raise ConfigError if neighborhoods beyond the kernels hold over half of distinct points.
+
+    Small clouds use all of their points up to the maximum of the kernels.
+    """
+    limit = max(num_points // 2, kernels.MAX_NEIGHBORS)
+    for name, k in numbers.items():
+        if k is not None and k > limit:
+            raise ConfigError(
+                f"{caller}: expected normals.{name} of at most {limit:,} for {num_points:,} "
+                f"distinct points, got {k:,}; lower it, as 50 suits most clouds."
+            )
+
+
 def search_distinct(points: Tensor, k: int, *, max_distance: float | None = None) -> Neighbors:
     """Find up to ``k`` neighbors of distinct points in canonical order; none without points."""
     if len(points) == 0:

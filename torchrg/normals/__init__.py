@@ -33,7 +33,7 @@ from torchrg._parallel import CHUNK_SIZE
 from torchrg.config import AnyConfig, NormalsConfig, settings_of
 from torchrg.errors import ConfigError
 from torchrg.neighbors import distinct_points
-from torchrg.neighbors.knn import check_neighbors, search_distinct
+from torchrg.neighbors.knn import check_neighbors, check_num_neighbors, search_distinct
 from torchrg.normals.estimators import ESTIMATORS, WITHOUT_GRADIENT, run_estimator
 from torchrg.normals.irls import fit_normals_irls
 from torchrg.normals.jet import JetFit, fit_jet, fit_normals_jet
@@ -149,7 +149,8 @@ def estimate_normals(
         sites, near, restore = tensor, neighbors, _unchanged
     else:
         distinct = distinct_points(tensor)
-        settings.check_num_points("estimate_normals", len(distinct.points))
+        numbers = {"k": settings.k, "adaptive_k": settings.adaptive_k}
+        check_num_neighbors("estimate_normals", len(distinct.points), **numbers)
         search = neighbors or partial(search_distinct, max_distance=max_distance)
         sites, restore = distinct.points, distinct.restore
         near = search(sites, settings.k)

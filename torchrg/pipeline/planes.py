@@ -22,7 +22,7 @@ from torchrg.neighbors import (
     measure_sampling,
     sample_voxels,
 )
-from torchrg.neighbors.knn import restrict_to_groups, search_distinct
+from torchrg.neighbors.knn import check_num_neighbors, restrict_to_groups, search_distinct
 from torchrg.neighbors.order import DistinctPoints
 from torchrg.neighbors.voxels import warn_about_voxel
 from torchrg.normals.estimators import run_estimator
@@ -174,7 +174,7 @@ def _segment(
     distinct = DistinctPoints(*map(scratch.store, distinct_points(points)))
     sites = _find_sites(distinct, voxel)
     num_sites, k = len(sites.points), config.normals.k
-    config.normals.check_num_points("segment_planes", num_sites)
+    check_num_neighbors("segment_planes", num_sites, k=k, adaptive_k=config.normals.adaptive_k)
     if num_sites < _MIN_NEIGHBORHOODS * k and (voxel is not None or min(num_sites, k) > 2):
         warn(
             f"segment_planes: expected at least {_MIN_NEIGHBORHOODS * k:,} distinct points for "
