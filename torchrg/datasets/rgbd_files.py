@@ -265,7 +265,7 @@ def read_table(path: Path, key: str) -> list[dict[str, float]]:
 def make_poses(translations: Tensor, rotations: Tensor) -> list[Tensor]:
     """Return matrices ``(4, 4)`` from translations ``(n, 3)`` and rotations.
 
-    Rotations are matrices ``(n, 3, 3)``, or quaternions x y z w ``(n, 4)``, see :func:`_rotations`.
+    Rotations are matrices ``(n, 3, 3)``, or quaternions x y z w ``(n, 4)``, see ``_rotations``.
     """
     poses = torch.eye(4, dtype=torch.float64).repeat(len(translations), 1, 1)
     poses[:, :3, :3] = _rotations(rotations) if rotations.ndim == 2 else rotations

@@ -239,7 +239,7 @@ def tabulate_planes(described: Json) -> Json:
 def encode_csv(described: Json) -> bytes:
     """Convert the result of :func:`describe_planes` to CSV with a header line.
 
-    Numbers and polygons are those of :func:`simplify_table`. Names of lengths and areas end in the
+    Numbers and polygons are those of ``simplify_table``. Names of lengths and areas end in the
     unit if it is known, as in ``area_m2``.
     """
     columns, text = tabulate_planes(simplify_table(described)), io.StringIO()
