@@ -2,7 +2,7 @@
 
     python scripts/memory_table.py building.laz --out planes.laz --limit-memory 1.6
 
-The arguments are those of ``torchrg segment``. Anonymous memory, which the system cannot reclaim,
+The arguments go to ``torchrg segment``. Anonymous memory, which the system cannot reclaim,
 is measured every 10 ms, above that of the loaded program. Arrays on disk take none of it and are
 not listed.
 """

@@ -105,7 +105,7 @@ def test_equations_and_inliers_are_those_of_open3d(seg):
     assert len(image.inliers(0)) == 1200
     with pytest.raises(IndexError, match=r"inliers: expected a row in \[0, 1\), got 3\."):
         seg.inliers(3)
-    with pytest.raises(IndexError, match=r"got -1; points of no plane are those of seg.labels =="):
+    with pytest.raises(IndexError, match=r"got -1; for points of no plane use seg.labels =="):
         seg.inliers(-1)
 
 

@@ -355,7 +355,7 @@ def _plan_with_bar(jobs: list[Job], arguments: Arguments) -> Plan:
 
 
 def _find_stale(scans: list[Job], arguments: Arguments) -> list[StaleResult]:
-    """Return the stale results; with --only or --only-failed, those of missing scans are kept."""
+    """Return the stale results; --only and --only-failed keep results of missing scans."""
     is_whole = (arguments.only is None and not arguments.only_failed) or arguments.prune
     return [result for result in find_stale(scans) if is_whole or result.scan is not None]
 

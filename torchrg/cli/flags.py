@@ -91,7 +91,7 @@ IntrinsicsFlag = Annotated[
 DepthScaleFlag = Annotated[
     float | None,
     Argument(
-        text="Depth units per meter, as 1000 for millimeters. convert rgbd knows those of layouts."
+        text="Depth units per meter, as 1000 for millimeters. convert rgbd knows them for layouts."
     ),
 ]
 DepthKindFlag = Annotated[

@@ -88,7 +88,7 @@ class FrameLayout(NamedTuple):
         signs: Patterns of further entries, one of which distinguishes layouts with the same mark,
             or ``file:text``. Default: the mark is enough.
         levels: Maximum depth of recordings below the root folder.
-        axes: Turn from torchrg's camera axes to those of the poses, ``(4, 4)``. Default: the same.
+        axes: Rotation from torchrg's camera axes to the axes of poses, ``(4, 4)``. Default: none.
         cameras: Cameras of recordings without a camera file, by a part of the recording's name.
     """
 
@@ -130,7 +130,7 @@ def _named_frames(depth: str, color: str, pose: str) -> Callable[[Path], Iterato
         for frame in _list_frames(folder, depth, color):
             path = folder / pose.replace("*", frame.name)
             if path.is_file():
-                rows = read_numbers(path, 4, "4 numbers, those of a 4 x 4 matrix,")
+                rows = read_numbers(path, 4, "4 numbers, a row of a 4 x 4 matrix,")
                 frame = frame._replace(pose=parse_pose(path, {"pose": rows}), sources=(path,))
             if not frame.name.endswith(".rendered"):
                 yield frame
@@ -251,7 +251,7 @@ def _replica_frames(folder: Path) -> Iterator[ListedFrame]:
     record = read_entries(calibration)
     entries = {**record, "depth_scale": parse_number(calibration, record, "scale")}
     track = folder / "traj.txt"
-    table = enumerate(read_numbers(track, 16, "16 numbers, those of a matrix,"))
+    table = enumerate(read_numbers(track, 16, "16 numbers of a matrix"))
     rows = {float(number): {"pose": row} for number, row in table}
     for frame in _list_frames(folder, "results/depth*", "results/frame*"):
         yield _placed(frame, {**entries, **rows.get(_number(frame), {})}, calibration, track)

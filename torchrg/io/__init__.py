@@ -280,7 +280,7 @@ def _get_format(path: Path, other: str = "", *, for_writing: bool = False) -> Fo
 
 
 def _check_signature(path: Path) -> None:
-    """Raise FormatError if the first bytes of a file are those of another format."""
+    """Raise FormatError if a file begins as another format does."""
     with path.open("rb") as stream:
         start = stream.read(max(map(len, _SIGNATURES)))
     kinds = next((kinds for first, kinds in _SIGNATURES.items() if start.startswith(first)), "")

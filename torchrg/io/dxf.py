@@ -22,8 +22,8 @@ def encode_dxf(described: Json) -> bytes:
     """Convert the result of :func:`torchrg.io.plane_table.describe_planes` to a DXF drawing.
 
     Each ring of a polygon is a closed 3D polyline on the layer of its class, ``WALL``, ``FLOOR``,
-    ``CEILING`` or ``OTHER``; a plane without a polygon has its bounding rectangle. Polygons are
-    those of CSV. The unit of the drawing is the meter if the table's is, else unknown.
+    ``CEILING`` or ``OTHER``; a plane without a polygon has its bounding rectangle. CSV has the
+    same polygons. The drawing is in meters if the table is, else its unit is unknown.
 
     Raises:
         MissingDependencyError: If ezdxf is not installed.

@@ -239,8 +239,8 @@ def tabulate_planes(described: Json) -> Json:
 def encode_csv(described: Json) -> bytes:
     """Convert the result of :func:`describe_planes` to CSV with a header line.
 
-    Numbers and polygons are those of ``simplify_table``. Names of lengths and areas end in the
-    unit if it is known, as in ``area_m2``.
+    ``simplify_table`` rounds numbers and straightens polygons. Names of lengths and areas end in
+    the unit if it is known, as in ``area_m2``.
     """
     columns, text = tabulate_planes(simplify_table(described)), io.StringIO()
     unit, powers = described.get("unit"), {"area": "2", "rms": "", "offset": ""}
@@ -255,8 +255,8 @@ def encode_csv(described: Json) -> bytes:
 def simplify_table(described: Json) -> Json:
     """Return the result of :func:`describe_planes` with few corners and rounded numbers.
 
-    Polygons are those of :func:`torchrg.io.outlines.straighten_rings`. Lengths and areas are
-    rounded to a hundredth of the median RMS distance, which adds nothing to their error.
+    :func:`torchrg.io.outlines.straighten_rings` simplifies the polygons. Lengths and areas are
+    rounded to a hundredth of the median RMS distance, far below their error.
     """
     planes = described["planes"]
     error = float(np.median([plane.get("rms", 0.0) for plane in planes])) if planes else 0.0

@@ -269,7 +269,7 @@ def _find_row(caller: str, row: SupportsIndex, lowest: int, num_planes: int) -> 
             "columns with masks, as in planes.normal[planes.area > 1]; a plane has an id."
         ) from None
     if not lowest <= index < num_planes:
-        fix = "; points of no plane are those of seg.labels == -1" * (index == -1)
+        fix = "; for points of no plane use seg.labels == -1" * (index == -1)
         raise IndexError(f"{caller}: expected a row in [{lowest}, {num_planes}), got {row}{fix}.")
     return index % num_planes
 
