@@ -102,35 +102,47 @@ def _draw_chunk(
     bounds = shown.bounds.permute(1, 2, 0).contiguous()
     bounds[:, 0] += (bounds[:, 1:] * away.T).sum(dim=1)
     dome = _DOME * shown.max_change / sizes.clamp(min=1).square_()
-    keys = torch.stack([rows + 1, torch.zeros_like(rows)], dim=1).int()
-    depth, keys = keys.view(torch.float32)[:, 1], keys.view(torch.int64).squeeze(1)
-    for dx, dy, count in _pixels_of(sizes):
+    numbers = (rows + 1).int()
+    for offsets, counts in _pixels_of(sizes):
+        count, (dx, dy) = int(counts[0]), offsets.T[..., None].to(start)
         limit = shown.max_change[:count]
-        change = torch.add(start[:count], slope_x[:count], alpha=dx)
-        change.add_(slope_y[:count], alpha=dy)
-        beyond = change.abs() > limit if dx or dy else torch.zeros_like(change, dtype=torch.bool)
+        change = torch.addcmul(start[:count], slope_x[:count], dx).addcmul_(slope_y[:count], dy)
+        beyond = change.abs() > limit
+        if not bool(offsets[0].any()):
+            beyond[0] = False
+        if len(offsets) > 1:
+            beyond |= torch.arange(count, device=counts.device) >= counts[:, None]
         for bound, bound_x, bound_y in bounds[:, :, :count]:
-            beyond |= torch.add(bound, bound_x, alpha=dx).add_(bound_y, alpha=dy) < 0
+            beyond |= torch.addcmul(bound, bound_x, dx).addcmul_(bound_y, dy) < 0
         change.clamp_(-limit, limit).add_(shown.inverse_depth[:count])
-        change.sub_(dome[:count], alpha=dx * dx + dy * dy)
-        depth[:count] = change.masked_fill_(beyond, -torch.inf)
-        front.scatter_reduce_(0, targets[:count] + (dy * stride + dx), keys[:count], "amax")
+        change.sub_(dome[:count] * (dx.square() + dy.square()))
+        keys = torch.empty(*change.shape, 2, dtype=torch.int32, device=change.device)
+        keys[..., 0] = numbers[:count]
+        keys[..., 1] = change.masked_fill_(beyond, -torch.inf).view(torch.int32)
+        covered = targets[:count] + (offsets[:, 1:] * stride + offsets[:, :1])
+        front.scatter_reduce_(0, covered.flatten(), keys.view(torch.int64).flatten(), "amax")
 
 
-def _pixels_of(sizes: Tensor) -> Iterator[tuple[int, int, int]]:
-    """Yield the pixels of discs of descending sizes, and the number of discs that cover each.
+def _pixels_of(sizes: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    """Yield pixels of discs of descending sizes, and the number of discs that cover each.
 
-    Pixels are columns and rows relative to the center, which every disc covers.
+    Pixels are columns and rows ``(n, 2)`` relative to the center, which every disc covers. Their
+    counts ``(n,)`` descend, at most to a half.
     """
-    reach = int(sizes[0]) if len(sizes) else -1
-    steps = range(-reach, reach + 1)
-    offsets = [(dx, dy) for dy in steps for dx in steps]
-    distances = torch.tensor([math.hypot(dx, dy) for dx, dy in offsets], device=sizes.device)
-    counts = torch.searchsorted(-sizes, -distances.to(sizes.dtype), right=True).tolist()
-    for (dx, dy), count in zip(offsets, counts, strict=True):
-        count = len(sizes) if dx == dy == 0 else count
-        if count > 0:
-            yield dx, dy, count
+    if len(sizes) == 0:
+        return
+    reach = int(sizes[0])
+    steps = torch.arange(-reach, reach + 1, device=sizes.device)
+    offsets = torch.cartesian_prod(steps, steps)
+    distances, order = offsets.to(sizes.dtype).norm(dim=1).sort(stable=True)
+    counts = torch.searchsorted(-sizes, -distances, right=True)
+    counts[:1] = len(sizes)
+    offsets, first = offsets[order], 0
+    halves = torch.searchsorted(-counts, -(counts + 1) // 2, right=True)
+    while first < len(offsets) and (count := int(counts[first])) > 0:
+        end = min(first + max(_CHUNK_DISCS // count, 1), int(halves[first]))
+        yield offsets[first:end], counts[first:end]
+        first = end
 
 
 def split_keys(keys: Tensor) -> tuple[Tensor, Tensor]:
