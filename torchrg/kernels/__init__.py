@@ -48,7 +48,7 @@ SIGNATURES = {
     "pass_edges": "f[3N] f[3N] b[N] f[N]? i[nk] b[nk]? l[n] x x n -> b[nk]",
     "neighbor_chords": "f[3N] i[nk] -> f[nk]",
     "grow_regions": "i[Nk] l[Nw] l[Nw]? b[N]? b[N] i[n] n I[N] I[N] -> ",
-    "mark_boundary": "i[N] i[Nk] b[Nk]? n n n n L[RR] B[N] -> ",
+    "mark_boundary": "i[N] i[Nk] b[Nk]? n n n n B[N] -> ",
     "crossing_edges": "i[N] i[Nk] b[Nk]? i[n] n n n -> i[nk] i[nk] i[nk] l[nk] l[1]",
     "line_cells": "f[N3] i[e] i[e] l[e] d[p3] d[p] x I[P] -> l[e] l[e] l[1]",
     "connected": "i[Nk] b[Nk]? b[nk] I[N] n n -> b[nk]",
@@ -76,7 +76,7 @@ SIGNATURES = {
     "segment_coordinates_double": "d[P] d[P] d[P] l[n] l[M] d[M3] d[MA3] -> d[An]",
     "segment_moments": "d[n] d[n] d[n] d[n] l[M] n -> d[M3] d[M33]",
     "reweigh_segments": "d[n] d[n] d[n] l[M] d[M3] d[M3] d[M] x x -> d[n] d[M] d[M]",
-    "kth_value": "d[n] n -> d[1] d[n]",
+    "kth_values": "d[n] l[M] l[M] -> d[M] d[n]",
     "fit_pixel_regions": "d[hw] d[w] d[h] d[hw] l[n] l[M] n x x x -> d[4n] d[M3] d[M33] d[M3] d[M] "
     "d[M] d[M]",
     "connect_pixels": "b[hw] b[hw] b[hw] -> l[hw]",

@@ -124,11 +124,9 @@ KERNEL grow_regions(int64_t num_points, int64_t k, int64_t num_words, int64_t nu
   return DONE;
 }
 
-// adjacency._mark_boundary: which rows have a neighbor of another region in some columns. Counts
-// the edges of each pair of regions in a table (R, R), which may be empty; threads may share it.
-KERNEL mark_boundary(int64_t num_points, int64_t k, int64_t num_regions, Ints labels, Ints indices,
-                     Flagged mask, int64_t first, int64_t last, int64_t low, int64_t high,
-                     int64_t* counts, bool* meets) {
+// adjacency._mark_boundary: which rows have a neighbor of another region in some columns.
+KERNEL mark_boundary(int64_t num_points, int64_t k, Ints labels, Ints indices, Flagged mask,
+                     int64_t first, int64_t last, int64_t low, int64_t high, bool* meets) {
   if (first < 0 || last > num_points || low < 0 || high > k) return TOO_WIDE;
   for (int64_t i = first; i < last; i++) {
     const int32_t *list = indices + i * k, label = labels[i];
@@ -141,12 +139,7 @@ KERNEL mark_boundary(int64_t num_points, int64_t k, int64_t num_regions, Ints la
     meets[i] = false;
     for (int64_t j = low; differences != 0 && j < high; j++) {
       const int32_t other = labels[list[j]];
-      if (other == label || other < 0 || (mask && !mask[i * k + j])) continue;
-      meets[i] = true;
-      if (label < 0 || num_regions == 0) break;
-      if (larger(label, other) >= num_regions) return TOO_WIDE;
-      const int64_t pair = smaller(label, other) * num_regions + larger(label, other);
-      __atomic_fetch_add(counts + pair, 1, __ATOMIC_RELAXED);
+      meets[i] |= other != label && other >= 0 && (!mask || mask[i * k + j]);
     }
   }
   return DONE;

@@ -295,11 +295,17 @@ KERNEL fit_pixel_regions(int64_t h, int64_t w, int64_t n, int64_t num, Doubles v
   });
 }
 
-// moments.kth_smallest: the value of rank k (from 0), NaN last.
-KERNEL kth_value(int64_t n, Doubles values, int64_t k, double* found, double* scratch) {
-  int64_t count = 0;
-  for (int64_t i = 0; i < n; i++) scratch[count] = values[i], count += values[i] == values[i];
-  *found = k >= 0 && k < count ? select(scratch, count, k) : __builtin_nan("");
+// Segments.quantile and moments.kth_smallest: the value of a rank (from 0) in each region, NaN last.
+KERNEL kth_values(int64_t n, int64_t num, Doubles values, Longs counts, Longs ranks, double* found,
+                  double* scratch) {
+  for (int64_t m = 0, i = 0; m < num; m++) {
+    if (counts[m] < 0 || counts[m] > n - i) return NO_SUCH_ROW;
+    int64_t count = 0;
+    for (const int64_t end = i + counts[m]; i < end; i++)
+      scratch[count] = values[i], count += values[i] == values[i];
+    const bool is_known = ranks[m] >= 0 && ranks[m] < count;
+    found[m] = is_known ? select(scratch, count, ranks[m]) : __builtin_nan("");
+  }
   return DONE;
 }
 

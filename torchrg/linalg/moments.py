@@ -21,9 +21,6 @@ from torchrg.linalg.eigen import smallest_eigenvector3
 
 _MIN_POINTS = 2**14
 """Minimum number of points per thread."""
-_SORTED_SIZE = 50
-"""Mean number of points per region below which one sort of all values is faster than a selection
-per region."""
 
 
 def covariance(patches: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -270,17 +267,16 @@ class Segments:
 
     def quantile(self, values: Tensor, fraction: float) -> Tensor:
         """Return the lower quantile of the values of each region, without interpolation."""
-        on_cpu = values.device.type == "cpu"
-        if len(values) == 0 or (on_cpu and len(values) >= _SORTED_SIZE * len(self.counts)):
-            parts = torch.split(values, self.counts.tolist())
-            each = [kth_smallest(region, int(fraction * (len(region) - 1))) for region in parts]
-            return torch.stack(each) if parts else values
+        ranks = (fraction * (self.counts - 1).double()).long()
+        if values.device.type == "cpu" and kernels.serve():
+            found = kernels.call("kth_values", values.double(), self.counts, ranks)[0]
+            return found.to(values.dtype)
         order = values.argsort()
         order = order[self.labels[order].argsort(stable=True)]
-        rank = (fraction * (self.counts - 1).double()).long()
-        index = self.counts.cumsum(0) - self.counts + rank
-        found = values[order[index.clamp(0, len(values) - 1)]]
-        return torch.where(self.counts > 0, found, torch.nan)
+        ends = self.counts.cumsum(0)
+        # A region without points has the appended NaN.
+        index = torch.where(self.counts > 0, ends - self.counts + ranks, len(values))
+        return torch.cat([values[order], values.new_tensor([torch.nan])])[index]
 
 
 def reduce_runs(values: Tensor, counts: Tensor, how: str) -> Tensor:
@@ -308,7 +304,8 @@ def kth_smallest(values: Tensor, k: int) -> Tensor:
         return values.new_tensor(torch.nan)
     if values.device.type == "cpu" and kernels.serve():
         # Up to thirty times faster than in torch.
-        return kernels.call("kth_value", values.double(), k)[0].to(values.dtype).squeeze(0)
+        run = torch.tensor([[len(values)], [k]], device="cpu")
+        return kernels.call("kth_values", values.double(), *run)[0].to(values.dtype).squeeze(0)
     return values.kthvalue(k + 1).values
 
 

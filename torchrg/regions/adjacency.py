@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchrg import kernels, scratch
 from torchrg._parallel import (
+    ROWS_AT_ONCE,
     ROWS_IN_CACHE,
     Returned,
     limit_rows,
@@ -217,19 +218,18 @@ def _are_served(labels: Tensor, neighbors: Neighbors) -> bool:
 
 def _mark_boundary(labels: Tensor, neighbors: Neighbors, columns: slice) -> Tensor:
     """Return which points have a neighbor in another region, ``(N,)``; labels are int32."""
-    meets = torch.empty_like(labels, dtype=torch.bool)
-    no_table = labels.new_empty((0, 0), dtype=torch.int64)
+    meets, is_served = torch.empty_like(labels, dtype=torch.bool), _are_served(labels, neighbors)
+    low, high, _ = columns.indices(neighbors.indices.shape[1])
 
     def mark(chunk: slice) -> None:
-        if _are_served(labels, neighbors):
-            low, high, _ = columns.indices(neighbors.indices.shape[1])
+        if is_served:
             where = chunk.start, chunk.stop, low, high
-            kernels.call("mark_boundary", labels, *neighbors, *where, no_table, meets)
+            kernels.call("mark_boundary", labels, *neighbors, *where, meets)
         else:
             near = neighbors.select(chunk)
             meets[chunk] = _crosses(labels, chunk, near, columns).any(dim=1)
 
-    at_once = limit_rows(ROWS_IN_CACHE, neighbors.indices.shape[1])
+    at_once = ROWS_AT_ONCE if is_served else limit_rows(ROWS_IN_CACHE, neighbors.indices.shape[1])
     map_chunks(mark, len(labels), at_once, labels.device)
     return meets
 

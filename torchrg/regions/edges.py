@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg import kernels
-from torchrg._parallel import ROWS_IN_CACHE, map_chunks, map_tasks, nonzero_rows
+from torchrg._parallel import ROWS_AT_ONCE, map_chunks, nonzero_rows
 from torchrg.config import GrowingConfig
 from torchrg.linalg.angles import deg_to_sq_chord, sq_chords
 from torchrg.linalg.moments import Columns, project, sq_lengths, to_column_major
@@ -171,8 +171,12 @@ def accept_edges(
     if config.coplanarity:
         if connect is not None and config.coplanarity_scope == "connected":
             connected = connect(cloud.neighbors.mask(rows))
-        mask = joins if cloud.reach is None else joins & cloud.reach[rows, None].isinf()
-        joins &= are_coplanar(cloud, rows, mask, connected, config.coplanarity_floor)
+        # The reach replaces eq. (11) where it is known.
+        tested = slice(None) if cloud.reach is None else nonzero_rows(cloud.reach[rows].isinf())
+        compared = None if connected is None else connected[tested]
+        joins[tested] = are_coplanar(
+            cloud, near.select(tested), joins[tested], compared, config.coplanarity_floor
+        )
     if connect is not None:
         if connected is None:
             connected = connect(joins)
@@ -215,27 +219,33 @@ def within_reach(
 
 
 def are_coplanar(
-    cloud: GrowingInput, rows: Rows, mask: Tensor, compared: Tensor | None, floor_fraction: float
+    cloud: GrowingInput,
+    near: Neighbors,
+    mask: Tensor,
+    compared: Tensor | None,
+    floor_fraction: float,
 ) -> Tensor:
-    """Return a mask of neighbors on the point's plane, eq. (11), and of those not in ``mask``.
+    """Return a mask of the neighbors in ``mask`` ``(n, K)`` on the point's plane, eq. (11).
 
     The limit is computed over the neighbors ``compared``, shape ``(n, K)``, default all. Its floor
     is a fraction of the distance to the farthest neighbor.
     """
-    near, result, open_rows = cloud.neighbors.select(rows), ~mask, mask.any(dim=1)
     columns = cloud.points.T, cloud.normals.T
     is_complete = compared is None and near.valid is None
     if is_complete and kernels.serve(near.indices, *columns, k=mask.shape[1]):
         factors = QN_FACTOR, floor_fraction
-        result, open_rows = kernels.call("are_coplanar", *columns, near.indices, mask, *factors)
+        found, open_rows = kernels.call("are_coplanar", *columns, near.indices, mask, *factors)
+        result = found & mask
+    else:
+        result, open_rows = mask.clone(), mask.any(dim=1)
     tested = nonzero_rows(open_rows)
     indices, counted = near.select(tested)
     offsets = gather_columns(cloud.points, indices)
     # |(p_j - p_i) . n_i|, below eq. (10).
-    residuals = project(offsets, cloud.normals[rows][tested]).abs_()
+    residuals = project(offsets, cloud.normals[indices[:, 0].long()]).abs_()
     floor = floor_fraction * patch_radii(offsets, counted)
     limits = coplanarity_limits(residuals, floor, counted if compared is None else compared[tested])
-    result[tested] = (residuals <= limits[:, None]) | ~mask[tested]
+    result[tested] = (residuals <= limits[:, None]) & mask[tested]
     return result
 
 
@@ -253,14 +263,18 @@ def coplanarity_limits(residuals: Tensor, floor: Tensor, mask: Tensor | None = N
 def neighborhood_radii(points: Tensor, neighbors: Neighbors, rows: Tensor | None = None) -> Tensor:
     """Return the distance of points ``rows`` ``(n,)``, default all, to their last neighbor."""
     indices, counted = neighbors
-    rows = torch.arange(len(points), device=points.device) if rows is None else rows
 
-    def measure(rows: Tensor) -> Tensor:
-        last = -1 if counted is None else counted[rows].sum(dim=1).sub_(1).clamp_(min=0)
-        ends = torch.stack([rows, indices[rows, last].long()], dim=1)
-        return patch_radii(gather_columns(points, ends))
+    def measure(chunk: slice) -> Tensor:
+        selected = chunk if rows is None else rows[chunk]
+        last = indices[selected, -1]
+        if counted is not None:
+            column = counted[selected].sum(dim=1, keepdim=True).sub_(1).clamp_(min=0)
+            last = indices[selected].gather(1, column).squeeze(1)
+        x, y, z = (column.index_select(0, last) - column[selected] for column in points.T)
+        return rounded_sqrt(sq_lengths((x, y, z)))
 
-    return torch.cat(map_tasks(measure, torch.split(rows, ROWS_IN_CACHE), points.device))
+    num_rows = len(points if rows is None else rows)
+    return torch.cat(map_chunks(measure, num_rows, ROWS_AT_ONCE, points.device))
 
 
 def patch_radii(columns: Columns, mask: Tensor | None = None) -> Tensor:
