@@ -53,8 +53,8 @@ def test_planes_of_large_regions_are_those_of_all_their_points():
     assert found.num_points.tolist() == [10_000, 10_000]
     torch.testing.assert_close(found.thickness, full.thickness, rtol=0.03, atol=0)
     assert (found.normal * full.normal).sum(dim=1).min() > np.cos(np.radians(0.02))
-    away = found.distances(cloud.points, labels)
-    assert (away - full.distances(cloud.points, labels)).abs().max() < 1e-3
+    heights = [planes.signed_distances(cloud.points, labels).abs() for planes in (found, full)]
+    assert (heights[0] - heights[1]).abs().max() < 1e-3
 
 
 def test_faces_of_facets_are_at_least_as_thick_as_these_may_lie_apart():

@@ -48,7 +48,7 @@ SIGNATURES = {
     "pass_edges": "f[3N] f[3N] b[N] f[N]? i[nk] b[nk]? l[n] x x n -> b[nk]",
     "neighbor_chords": "f[3N] i[nk] -> f[nk]",
     "grow_regions": "i[Nk] l[Nw] l[Nw]? b[N]? b[N] i[n] n I[N] I[N] -> ",
-    "mark_boundary": "i[N] i[Nk] b[Nk]? n n n n B[N] -> ",
+    "mark_boundary": "i[N] i[Nk] b[Nk]? i[n] n n -> b[n]",
     "crossing_edges": "i[N] i[Nk] b[Nk]? i[n] n n n -> i[nk] i[nk] i[nk] l[nk] l[1]",
     "line_cells": "f[N3] i[e] i[e] l[e] d[p3] d[p] x I[P] -> l[e] l[e] l[1]",
     "connected": "i[Nk] b[Nk]? b[nk] I[N] n n -> b[nk]",

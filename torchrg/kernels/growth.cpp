@@ -124,11 +124,13 @@ KERNEL grow_regions(int64_t num_points, int64_t k, int64_t num_words, int64_t nu
   return DONE;
 }
 
-// adjacency._mark_boundary: which rows have a neighbor of another region in some columns.
-KERNEL mark_boundary(int64_t num_points, int64_t k, Ints labels, Ints indices, Flagged mask,
-                     int64_t first, int64_t last, int64_t low, int64_t high, bool* meets) {
-  if (first < 0 || last > num_points || low < 0 || high > k) return TOO_WIDE;
-  for (int64_t i = first; i < last; i++) {
+// adjacency._boundary_rows: which rows have a neighbor of another region in some columns.
+KERNEL mark_boundary(int64_t num_points, int64_t k, int64_t num_rows, Ints labels, Ints indices,
+                     Flagged mask, Ints rows, int64_t low, int64_t high, bool* meets) {
+  if (low < 0 || high > k) return TOO_WIDE;
+  for (int64_t r = 0; r < num_rows; r++) {
+    const int64_t i = rows[r];
+    if (!is_row(rows[r], num_points)) return NO_SUCH_ROW;
     const int32_t *list = indices + i * k, label = labels[i];
     if (!are_rows(list + low, high - low, num_points)) return NO_SUCH_ROW;
     int32_t differences = 0;
@@ -136,10 +138,10 @@ KERNEL mark_boundary(int64_t num_points, int64_t k, Ints labels, Ints indices, F
       const int32_t other = labels[list[j]];
       differences |= (other ^ label) & ~(other >> 31);  // negative labels do not count
     }
-    meets[i] = false;
+    meets[r] = false;
     for (int64_t j = low; differences != 0 && j < high; j++) {
       const int32_t other = labels[list[j]];
-      meets[i] |= other != label && other >= 0 && (!mask || mask[i * k + j]);
+      meets[r] |= other != label && other >= 0 && (!mask || mask[i * k + j]);
     }
   }
   return DONE;

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -137,7 +138,8 @@ class KnnAdjacency:
 
     def boundary(self, labels: Tensor) -> Tensor:
         """Return the points with a nearest neighbor in another region, also unlabeled points."""
-        return nonzero_rows(_mark_boundary(labels.to(torch.int32), self._all, _NEAREST))
+        rows = torch.arange(len(labels), dtype=torch.int32, device=labels.device)
+        return _boundary_rows(rows, labels.to(torch.int32), self._all, _NEAREST).long()
 
 
 def find_region_pairs(
@@ -172,13 +174,19 @@ class _RegionEdges:
         self._labels, self._neighbors, self._columns = labels.to(torch.int32), neighbors, columns
         self._num_regions = max(int(labels.max()) + 1, 1) if len(labels) else 1
         self._at_once = limit_rows(ROWS_IN_CACHE, neighbors.indices.shape[1])
-        meets = _mark_boundary(self._labels, neighbors, columns)
-        self._rows = nonzero_rows(meets & (self._labels >= 0)).to(torch.int32)
+        labeled = nonzero_rows(self._labels >= 0).to(torch.int32)
+        self._rows = _boundary_rows(labeled, self._labels, neighbors, columns)
         chunks = torch.split(self._rows, self._at_once)
         keys = torch.cat([self._find(rows)[3].clone() for rows in chunks])
-        self._keys, self.counts = torch.unique(keys, return_counts=True)
-        first, second = self._keys // self._num_regions, self._keys % self._num_regions
-        self.pairs = torch.stack([first, second], dim=1)
+        if self._num_regions**2 <= len(labels):
+            # A table of all pairs is faster than a sort.
+            table = torch.bincount(keys)
+            keys, self._index = nonzero_rows(table), ((table > 0).cumsum(0) - 1).__getitem__
+            self.counts = table[keys]
+        else:
+            keys, self.counts = torch.unique(keys, return_counts=True)
+            self._index = partial(torch.searchsorted, keys)
+        self.pairs = torch.stack([keys // self._num_regions, keys % self._num_regions], dim=1)
 
     def _find(self, rows: Tensor) -> list[Tensor]:
         """Return end points and columns of the edges of points, and the keys of their pairs."""
@@ -203,7 +211,7 @@ class _RegionEdges:
 
         def find(rows: Tensor) -> Returned:
             *edges, keys = self._find(rows)
-            return work(_Contacts(torch.searchsorted(self._keys, keys), *edges))
+            return work(_Contacts(self._index(keys), *edges))
 
         chunks = torch.split(self._rows, self._at_once)
         for batch in split_rows(len(chunks), _CHUNKS_AT_ONCE):
@@ -216,22 +224,20 @@ def _are_served(labels: Tensor, neighbors: Neighbors) -> bool:
     return kernels.serve(labels, *present) and all(part.is_contiguous() for part in present)
 
 
-def _mark_boundary(labels: Tensor, neighbors: Neighbors, columns: slice) -> Tensor:
-    """Return which points have a neighbor in another region, ``(N,)``; labels are int32."""
-    meets, is_served = torch.empty_like(labels, dtype=torch.bool), _are_served(labels, neighbors)
+def _boundary_rows(rows: Tensor, labels: Tensor, neighbors: Neighbors, columns: slice) -> Tensor:
+    """Return which of the rows have a neighbor in another region; all of them are int32."""
     low, high, _ = columns.indices(neighbors.indices.shape[1])
+    is_served = _are_served(labels, neighbors)
 
-    def mark(chunk: slice) -> None:
+    def mark(chunk: slice) -> Tensor:
+        part = rows[chunk]
         if is_served:
-            where = chunk.start, chunk.stop, low, high
-            kernels.call("mark_boundary", labels, *neighbors, *where, meets)
-        else:
-            near = neighbors.select(chunk)
-            meets[chunk] = _crosses(labels, chunk, near, columns).any(dim=1)
+            return kernels.call("mark_boundary", labels, *neighbors, part, low, high)[0]
+        return _crosses(labels, part, neighbors.select(part), columns).any(dim=1)
 
     at_once = ROWS_AT_ONCE if is_served else limit_rows(ROWS_IN_CACHE, neighbors.indices.shape[1])
-    map_chunks(mark, len(labels), at_once, labels.device)
-    return meets
+    meets = torch.cat(map_chunks(mark, len(rows), at_once, labels.device))
+    return rows.index_select(0, nonzero_rows(meets))
 
 
 def _crosses(labels: Tensor, rows: Rows, near: Neighbors, columns: slice) -> Tensor:

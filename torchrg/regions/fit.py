@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrg._parallel import ROWS_AT_ONCE, map_tasks
+from torchrg._parallel import map_tasks
 from torchrg.config import Auto, GrowingConfig
 from torchrg.linalg.moments import Segments, eigh3_lapack
 from torchrg.linalg.precision import coordinate_resolution
@@ -104,17 +104,18 @@ class RegionPlanes(NamedTuple):
         limit = _MAX_FACET_RMS * float(facet_tolerance)
         return self._replace(curved=self.curved & (self.rms > limit))
 
-    def distances(self, points: Tensor, regions: Tensor) -> Tensor:
-        """Return the distance of each point ``(n, 3)`` to the plane of a region ``(n,)``."""
-        parts = zip(
-            *(torch.split(v, ROWS_AT_ONCE) for v in (points, regions[:, None])), strict=True
-        )
-        return torch.cat([self.signed_distances(*part) for part in parts]).squeeze(1).abs_()
-
     def signed_distances(self, points: Tensor, regions: Tensor) -> Tensor:
-        """Return signed distances of points ``(n, 3)`` to planes of regions ``(n, C)``."""
-        offset = points.double()[:, None] - self.center[regions]
-        return (offset * self.normal[regions]).sum(dim=2)
+        """Return signed distances ``(*, n)`` of points ``(n, 3)`` to planes of regions ``(*, n)``.
+
+        Unlabeled points, which have negative regions, have any distance.
+        """
+        rows, total = regions.clamp(min=0).reshape(-1), 0.0
+        axes = zip(points.unbind(dim=1), self.center.T, self.normal.T, strict=True)
+        for column, *plane in axes:
+            # A third of the time of a gather of vectors.
+            start, slope = (part.index_select(0, rows).view(regions.shape) for part in plane)
+            total = (column - start).mul_(slope).add_(total)
+        return total
 
 
 def fit_planes(

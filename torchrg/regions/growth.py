@@ -23,7 +23,7 @@ from torchrg.neighbors.order import ascending_rows
 from torchrg.regions.adjacency import KnnAdjacency
 from torchrg.regions.edges import GrowingInput, has_late_promotion, mark_edges, neighborhood_radii
 from torchrg.regions.fit import MIN_FITTED, RegionFits, find_solid_regions
-from torchrg.regions.repair import merge_facets, refine_regions
+from torchrg.regions.repair import keep_regions, merge_facets, refine_regions
 from torchrg.regions.splits import cut_bridges, find_mixed_regions, split_levels
 from torchrg.structures import UNLABELED, AnyCloud, Neighbors
 from torchrg.structures.points import Colors, Points, Values
@@ -165,9 +165,7 @@ def label_regions(
         labels = labels if split is labels else rank_by_size(split, 1)
     if config.absorb or config.merge_coplanar or config.max_plane_residual is not None:
         labels = rank_by_size(refine_regions(cloud, labels, config, fits), int(config.min_size))
-    solid = find_solid_regions(cloud, labels)
-    kept = torch.cat([~solid, solid.new_zeros(1)])
-    return rank_by_size(labels.where(kept[labels], UNLABELED), 1)
+    return keep_regions(labels, ~find_solid_regions(cloud, labels))
 
 
 def checked_cloud(
@@ -282,14 +280,14 @@ def grow(cloud: GrowingInput, config: GrowingConfig, chunk_size: int) -> Tensor:
     """
     columns = (cloud.curvature, cloud.valid, cloud.neighbors.indices)
     curvature, valid, indices = (column.cpu() for column in columns)
-    growing = curvature[valid]
-    limit = kth_smallest(growing, int(config.curvature_quantile * (len(growing) - 1)))
-    is_seed, order = curvature <= limit, ascending_rows(curvature)
-    order = order[valid[order]].int()
+    # Invalid points are last.
+    curvature, num_valid = curvature.where(valid, torch.inf), int(torch.count_nonzero(valid))
+    limit = kth_smallest(curvature, max(int(config.curvature_quantile * (num_valid - 1)), 0))
+    is_seed, order = curvature <= limit, ascending_rows(curvature)[:num_valid].int()
     on_device = limit.to(cloud.points.device)
     joins, makes_seed = mark_edges(cloud, config, on_device, chunk_size=chunk_size)
     if makes_seed is None and int(config.min_size) > indices.shape[1]:
-        order = order[: int(torch.count_nonzero(growing <= limit))]
+        order = order[: int(torch.count_nonzero(is_seed))]
     tables, late = (indices, joins, makes_seed, is_seed, valid), has_late_promotion(config)
     if kernels.serve(indices, valid):
         roots = torch.full(valid.shape, UNLABELED, dtype=torch.int32, device="cpu")

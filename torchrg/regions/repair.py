@@ -3,6 +3,7 @@
 import heapq
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple, Protocol
 
 import torch
@@ -70,8 +71,8 @@ def refine_regions(
     fits, adjacency = fits or RegionFits(cloud, config), KnnAdjacency(cloud.neighbors)
     if config.max_plane_residual is not None:
         planes = fits.get(labels)
-        limit, region = config.max_plane_residual * planes.thickness, labels.clamp(min=0)
-        far = planes.distances(cloud.points, region) > limit[region]
+        limit = value_of_points(config.max_plane_residual * planes.thickness, labels, torch.inf)
+        far = planes.signed_distances(cloud.points, labels).abs_() > limit
         labels = torch.where(far, UNLABELED, labels)
     if config.absorb:
         planes = fits.get(labels)
@@ -86,14 +87,14 @@ def refine_regions(
             # Facet normals are unreliable; the distance decides.
             max_angle_deg=90.0 if config.faceted is True else config.absorb_angle_deg,
         )
-        labels = _remove_small(labels, int(config.min_size))
+        labels = remove_small(labels, int(config.min_size))
     if config.merge_coplanar:
         planes = fits.get(labels)
         contacts = _pairs_to_merge(labels, adjacency, planes, cloud.neighbors)
         labels = merge_coplanar(labels, contacts, planes, tolerance=config.merge_tolerance)
     if config.refine_borders:
         faceted = config.faceted is True
-        labels = _remove_small(labels, 1)
+        labels = remove_small(labels, 1)
         planes = fits.get(labels)
         # The plane of a bent region does not show where the region ends.
         vague = planes.bent | (planes.num_points < MIN_FITTED)
@@ -116,8 +117,7 @@ def _remove_inconsistent(
 ) -> Tensor:
     """Remove small regions with inconsistent normals; the labels may then have gaps."""
     small = torch.bincount(labels + 1, minlength=1)[1:] < int(config.min_size)
-    small = torch.cat([small, small.new_zeros(1)])
-    segments = Segments(torch.where(small[labels], labels, UNLABELED))
+    segments = Segments(torch.where(value_of_points(small, labels, False), labels, UNLABELED))
     ours = segments.gather_columns(cloud.normals)
     theirs = [segments.broadcast(column) for column in normal.unbind(dim=1)]
     is_consistent = segments.mean(sq_chords(ours, theirs)) <= deg_to_sq_chord(
@@ -127,19 +127,28 @@ def _remove_inconsistent(
     return labels.index_fill(0, inconsistent, UNLABELED)
 
 
-def _remove_small(labels: Tensor, min_size: int) -> Tensor:
+def remove_small(labels: Tensor, min_size: int) -> Tensor:
     """Remove regions smaller than ``min_size`` and make the labels consecutive."""
     return keep_regions(labels, torch.bincount(labels + 1, minlength=1)[1:] >= max(min_size, 1))
 
 
 def keep_regions(labels: Tensor, kept: Tensor) -> Tensor:
     """Unlabel the points of other regions than the ``kept`` ``(M,)``, and renumber these."""
+    if bool(kept.all()):
+        return labels
     return remap_labels(labels, torch.where(kept, kept.cumsum(0) - 1, UNLABELED))
 
 
 def remap_labels(labels: Tensor, mapping: Tensor) -> Tensor:
     """Map the labels of regions to ``mapping`` ``(M,)``; unlabeled points stay unlabeled."""
-    return scratch.store(torch.cat([mapping, mapping.new_tensor([UNLABELED])])[labels])
+    return scratch.store(value_of_points(mapping, labels, UNLABELED))
+
+
+def value_of_points(values: Tensor, labels: Tensor, unlabeled: float) -> Tensor:
+    """Return the value of each point's region, given values ``(M,)`` and labels of any shape."""
+    table = torch.cat([values.new_tensor([unlabeled]), values])
+    # Four times faster than indexing.
+    return table.index_select(0, (labels + 1).reshape(-1)).view(labels.shape)
 
 
 def assign_unlabeled(
@@ -170,15 +179,14 @@ def assign_unlabeled(
     while len(rows):
         joining = []
         for part in torch.split(rows, ROWS_AT_ONCE):
-            near = labels[adjacency.neighbor_rows(part)]
-            is_adjacent = (near >= 0).any(dim=1)
-            part, near = part[is_adjacent], near[is_adjacent]
-            region = near.clamp(min=0)
-            distance = planes.signed_distances(points[part], region).abs()
-            fits = (near >= 0) & (distance <= reach[region])
+            near = Neighbors(adjacency.neighbor_rows(part).T).gather(labels)
+            is_adjacent = nonzero_rows((near >= 0).any(dim=0))
+            part, near = part[is_adjacent], near[:, is_adjacent]
+            distance = planes.signed_distances(points[part], near).abs_()
+            fits = distance <= value_of_points(reach, near, torch.nan)
             if normals is not None:
-                ours = normals[part].double()[:, :, None].unbind(dim=1)
-                fits &= sq_chords(ours, planes.normal[region].unbind(dim=2)) <= limit
+                ours, theirs = normals[part].double(), planes.normal[near]
+                fits &= sq_chords(ours.unbind(dim=1), theirs.unbind(dim=2)) <= limit
             choice, min_cost = _lowest(torch.where(fits, distance, torch.inf), near)
             joining.append(torch.stack([part, choice])[:, min_cost.isfinite()])
         rows, choice = torch.cat(joining, dim=1)
@@ -190,10 +198,10 @@ def assign_unlabeled(
 
 
 def _lowest(cost: Tensor, options: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the cheapest option ``(n,)`` and its cost; ties go to the smaller option."""
-    min_cost = cost.amin(dim=1, keepdim=True)
+    """Return the cheapest of options ``(C, n)`` and its cost; ties go to the smaller option."""
+    min_cost = cost.amin(dim=0)
     ranked = torch.where(cost == min_cost, options, torch.iinfo(options.dtype).max)
-    return ranked.amin(dim=1), min_cost.squeeze(1)
+    return ranked.amin(dim=0), min_cost
 
 
 def _pairs_to_merge(
@@ -204,7 +212,7 @@ def _pairs_to_merge(
     At the end of a strip narrower than a neighborhood, such as the rim of a table top, the nearest
     points belong to the adjacent surfaces.
     """
-    strips = torch.cat([planes.strips, planes.strips.new_zeros(1)])[labels]
+    strips = value_of_points(planes.strips, labels, False)
     pairs, counts = adjacency.contacts(labels)
     others = find_region_pairs(torch.where(strips, labels, UNLABELED), neighbors)
     return torch.cat([pairs, others[0]]), torch.cat([counts, others[1]])
@@ -402,18 +410,8 @@ def refine_borders(
     ``reach`` ``(M,)`` is the maximum point-to-plane distance, NaN for regions that are not flat,
     which are left unchanged.
     """
-
-    def choose(labels: Tensor, rows: Tensor, near: Tensor) -> Tensor:
-        near, chosen = labels[near], labels[rows]
-
-        def work(block: slice) -> None:
-            chosen[block] = _choose_regions(cloud, labels, planes, reach, rows[block], near[block])
-
-        map_chunks(work, len(rows), ROWS_IN_CACHE, labels.device)
-        return torch.where(cloud.valid[rows], chosen, labels[rows])
-
     flat = torch.cat([reach.isfinite(), reach.new_ones(1, dtype=torch.bool)])
-    return _reassign(cloud, labels, flat, choose)
+    return _reassign(cloud, labels, flat, partial(_choose_regions, cloud, planes, reach))
 
 
 def _reassign(
@@ -425,24 +423,28 @@ def _reassign(
     """Reassign boundary points; changed points and their neighbors are revisited.
 
     ``choose`` returns new labels, given all labels, the rows ``(n,)`` of points, and the rows of
-    their 8 nearest neighbors. Only points of ``movable`` regions are passed, ``(M + 1,)``, the last
-    entry for unlabeled points.
+    their 8 nearest neighbors ``(8, n)``. Only valid points of ``movable`` regions are passed, ``(M
+    + 1,)``, the last entry for unlabeled points.
     """
     adjacency = KnnAdjacency(cloud.neighbors)
-    labels = labels.clone()
+    # int32 is faster to index and to compare.
+    labels = labels.to(torch.int32, copy=True)
     rows = adjacency.boundary(labels)
     for _ in range(_MAX_PASSES):
-        rows = rows[movable[labels[rows]]]
+        rows = rows[movable[labels[rows]] & cloud.valid[rows]]
         near = adjacency.neighbor_rows(rows)
-        parts = zip(torch.split(rows, ROWS_AT_ONCE), torch.split(near, ROWS_AT_ONCE), strict=True)
-        chosen = torch.cat([choose(labels, *part) for part in parts])
+
+        def work(block: slice, rows: Tensor = rows, near: Tensor = near) -> Tensor:
+            return choose(labels, rows[block], near[block].T)
+
+        chosen = torch.cat(map_chunks(work, len(rows), ROWS_IN_CACHE, labels.device))
         moved = chosen != labels[rows]
         if not bool(moved.any()):
             break
         rows = rows[moved]
         labels[rows] = chosen[moved]
         rows = torch.unique(torch.cat([rows, near[moved].flatten()]))
-    return labels
+    return labels.long()
 
 
 def assign_levels(cloud: GrowingInput, labels: Tensor, planes: RegionPlanes) -> Tensor:
@@ -456,14 +458,19 @@ def assign_levels(cloud: GrowingInput, labels: Tensor, planes: RegionPlanes) -> 
     flat = torch.cat([flat, flat.new_zeros(1)])
 
     def choose(labels: Tensor, rows: Tensor, near: Tensor) -> Tensor:
-        label, options = labels[rows], labels[near]
-        turn = unsigned_angle_deg(planes.normal[options], planes.normal[label][:, None])
-        usable = flat[options] & (options != label[:, None]) & (turn <= PARALLEL_DEG)
-        distance = planes.signed_distances(cloud.points[rows], options).abs()
-        other, min_cost = _lowest(torch.where(usable, distance, torch.inf), options)
-        both = nonzero_rows(min_cost.isfinite())
-        pair = torch.stack([label, other], dim=1)[both]
-        group = torch.cat([rows[:, None], near], dim=1)[both]
+        label, options = labels.index_select(0, rows), Neighbors(near).gather(labels)
+        every = torch.cat([label[None], options])
+        distance = planes.signed_distances(cloud.points[rows], every).abs_()
+        usable = (distance[1:] < distance[0]) & flat[options] & (options != label)
+        open_rows = nonzero_rows(usable.any(dim=0))
+        options, usable = options[:, open_rows], usable[:, open_rows]
+        turn = unsigned_angle_deg(planes.normal[options], planes.normal[label[open_rows]])
+        cost = torch.where(usable & (turn <= PARALLEL_DEG), distance[1:, open_rows], torch.inf)
+        other, min_cost = _lowest(cost, options)
+        found = nonzero_rows(min_cost.isfinite())
+        both, other = open_rows[found], other[found]
+        pair = torch.stack([label[both], other], dim=1)
+        group = torch.cat([rows[None], near])[:, both].T.contiguous()
         members = (labels[group][:, :, None] == pair[:, None]).any(dim=2, keepdim=True)
         normal, center = planes.normal[pair], planes.center[pair]
         normal = torch.where((normal[:, :1] * normal).sum(dim=2, keepdim=True) < 0, -normal, normal)
@@ -471,48 +478,47 @@ def assign_levels(cloud: GrowingInput, labels: Tensor, planes: RegionPlanes) -> 
         offset = (offset * normal[:, None]).sum(dim=3)
         thickness = planes.thickness[pair].amax(dim=1)
         apart = (offset[:, 0, 0] - offset[:, 0, 1]).abs() >= _MIN_STEP * thickness
-        mean, first = (offset * members).sum(dim=1).abs(), offset[:, 0].abs()
-        moved = apart & (mean[:, 1] < mean[:, 0]) & (first[:, 1] < first[:, 0])
-        moved &= first[:, 1] <= _LEVEL_REACH * planes.thickness[pair[:, 1]]
-        return label.index_copy(0, both[moved], other[both[moved]])
+        mean = (offset * members).sum(dim=1).abs()
+        moved = apart & (mean[:, 1] < mean[:, 0])
+        moved &= offset[:, 0, 1].abs() <= _LEVEL_REACH * planes.thickness[other]
+        return label.index_copy(0, both[moved], other[moved])
 
     return _reassign(cloud, labels, flat, choose)
 
 
 def _choose_regions(
     cloud: GrowingInput,
-    labels: Tensor,
     planes: RegionPlanes,
     reach: Tensor,
+    labels: Tensor,
     rows: Tensor,
     near: Tensor,
 ) -> Tensor:
-    """Choose a region for each of ``rows`` among its label and its neighbors' labels ``near``."""
-    label, position = labels[rows], cloud.points[rows].double()
-    options = torch.cat([label[:, None], near], dim=1)
-    region = options.clamp(min=0)
-    distance = planes.signed_distances(position, region).abs()
-    usable = (options >= 0) & (distance <= reach[region])
-    cost = (distance / planes.thickness[region]).square() + _ROUNDING**2 * (
-        options != label[:, None]
-    )
-    cost = torch.where(usable, cost, torch.inf)
+    """Choose a region for each of ``rows`` among its label and those of ``near`` ``(8, n)``."""
+    label, position = labels.index_select(0, rows), cloud.points[rows]
+    options = torch.cat([label[None], Neighbors(near).gather(labels)])
+    distance = planes.signed_distances(position, options).abs_()
+    usable = distance <= value_of_points(reach, options, torch.nan)
+    cost = (distance / value_of_points(planes.thickness, options, 1.0)).square()
+    cost = torch.where(usable, cost + _ROUNDING**2 * (options != label), torch.inf)
     first, first_cost = _lowest(cost, options)
-    second, second_cost = _lowest(torch.where(options == first[:, None], torch.inf, cost), options)
+    second, second_cost = _lowest(torch.where(options == first, torch.inf, cost), options)
     # Beyond the reach of its region, a point keeps the label of growth unless another is nearer.
-    is_nearest = torch.where(usable, distance, torch.inf).amin(dim=1) >= distance[:, 0]
-    remains = ((label >= 0) & ~usable[:, 0] & is_nearest) | first_cost.isinf()
+    is_nearest = torch.where(usable, distance, torch.inf).amin(dim=0) >= distance[0]
+    remains = ((label >= 0) & ~usable[0] & is_nearest) | first_cost.isinf()
     choice = torch.where(remains, label, first)
 
-    both = (second_cost.isfinite() & ~remains).nonzero().squeeze(1)
-    rows, label, position = rows[both], label[both], position[both]
-    pair = first[both], second[both]
+    both = nonzero_rows(second_cost.isfinite() & ~remains)
+    label, position, pair = label[both], position[both], (first[both], second[both])
+    lists = cloud.neighbors.select(rows[both])
+    members = torch.where(lists.mask(), lists.gather(labels), UNLABELED)
+    columns = [lists.gather(column).double() for column in cloud.points.unbind(dim=1)]
     # A rounded edge is as far from a precise plane as from a rough one: both have one unit.
     scale = torch.maximum(planes.thickness[pair[0]], planes.thickness[pair[1]])
     costs = []
     for one, other in (pair, pair[::-1]):
-        height = planes.signed_distances(position, one[:, None]).squeeze(1)
-        over = _overshoot(cloud, labels, planes, rows, position, one, other)
+        height = planes.signed_distances(position, one)
+        over = _overshoot(planes, position, columns, members == one[:, None], (one, other))
         excess = (height.square() + over.square()) / scale.square()
         costs.append(excess + _ROUNDING**2 * (one != label))
     better = torch.where(costs[1] < costs[0], pair[1], pair[0])
@@ -523,25 +529,26 @@ def _choose_regions(
 
 
 def _overshoot(
-    cloud: GrowingInput,
-    labels: Tensor,
     planes: RegionPlanes,
-    rows: Tensor,
     position: Tensor,
-    label: Tensor,
-    other: Tensor,
+    columns: list[Tensor],
+    inside: Tensor,
+    pair: tuple[Tensor, Tensor],
 ) -> Tensor:
-    """Return how far the projections of points lie beyond the plane at which their region ends."""
-    near = cloud.neighbors.select(rows)
-    inside = (near.gather(labels) == label[:, None]) & near.mask()
-    offset = torch.zeros_like(inside, dtype=torch.float64)
-    columns = (cloud.points, planes.center[other], planes.normal[other])
-    for x, start, slope in zip(*(values.unbind(dim=1) for values in columns), strict=True):
-        offset += (near.gather(x).double() - start[:, None]) * slope[:, None]
+    """Return how far the projections of points lie beyond the plane at which their region ends.
+
+    ``columns`` are the coordinates of the neighbors ``(n, K)``, ``inside`` masks those in the
+    region. A ``pair`` is the region and the other plane.
+    """
+    (label, other), offset = pair, torch.zeros_like(columns[0])
+    plane = planes.center[other].T, planes.normal[other].T
+    for x, start, slope in zip(columns, *plane, strict=True):
+        offset += (x - start[:, None]) * slope[:, None]
     offset *= inside
     total = offset.sum(dim=1)
     rounding = _ROUNDING * planes.thickness[label] * inside.sum(dim=1)
     one_sided = total.abs() > (_MIN_ONE_SIDED * offset.abs().sum(dim=1)).clamp(min=rounding)
-    foot = position - planes.signed_distances(position, label[:, None]) * planes.normal[label]
-    over = -total.sign() * planes.signed_distances(foot, other[:, None]).squeeze(1)
+    height = planes.signed_distances(position, label)[:, None]
+    foot = position - height * planes.normal[label]
+    over = -total.sign() * planes.signed_distances(foot, other)
     return torch.where(one_sided, over.clamp(min=0), 0.0)

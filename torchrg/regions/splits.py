@@ -20,7 +20,13 @@ from torchrg.linalg.moments import Segments, sum_neighbors
 from torchrg.regions.adjacency import PARALLEL_DEG, KnnAdjacency
 from torchrg.regions.edges import GrowingInput, accept_edges, within_angle
 from torchrg.regions.fit import MAX_FITTED, RegionPlanes, fit_planes, fit_regions
-from torchrg.regions.repair import keep_regions, pairwise_misfit, remap_labels
+from torchrg.regions.repair import (
+    keep_regions,
+    pairwise_misfit,
+    remap_labels,
+    remove_small,
+    value_of_points,
+)
 from torchrg.robust.scale import MAD_FACTOR
 from torchrg.structures import UNLABELED, Neighbors
 
@@ -123,15 +129,16 @@ def find_mixed_regions(
     """
     limit = _EXACT_REACH * planes.floor
     limit = torch.where(planes.reach.isfinite(), torch.maximum(planes.reach, limit), limit)
-    region, has_region = labels.clamp(min=0), labels >= 0
-    off = has_region & (planes.distances(cloud.points, region) > limit[region])
-    num_off = torch.bincount(labels[off], minlength=len(limit))
+    distance = planes.signed_distances(cloud.points, labels).abs_()
+    off = distance > value_of_points(limit, labels, torch.inf)
+    num_off = torch.bincount(labels[nonzero_rows(off)], minlength=len(limit))
     on_plane = num_off <= _MAX_OFF_PLANE_FRACTION * planes.num_points
     mixed = num_off >= int(config.min_size)
-    rows = (torch.where(on_plane[region], off, has_region) & mixed[region]).nonzero().squeeze(1)
-    if len(rows) == 0:
+    if not bool(mixed.any()):
         return None
-    remaining = (has_region & ~off & (on_plane & mixed)[region]).nonzero().squeeze(1)
+    is_partial = value_of_points(mixed & on_plane, labels, False)
+    rows = nonzero_rows(value_of_points(mixed & ~on_plane, labels, False) | (is_partial & off))
+    remaining = nonzero_rows(is_partial & ~off)
     parts = []
     for chunk in torch.split(remaining, ROWS_AT_ONCE):
         ours, theirs = cloud.normals[chunk].double(), planes.normal[labels[chunk]]
@@ -173,7 +180,7 @@ def cut_bridges(
     if len(rows) == 0:
         return labels
     cores = torch.full_like(labels, UNLABELED).index_copy_(0, mixed.rows, grown)
-    cores, on_core_plane = _add_plane_cores(labels, cores, mixed)
+    cores, plane_rows = _add_plane_cores(labels, cores, mixed)
     narrow = cores.to(torch.int32)
 
     def meets_other(chunk: Tensor) -> Tensor:
@@ -182,51 +189,49 @@ def cut_bridges(
 
     rows = rows[torch.cat([meets_other(chunk) for chunk in torch.split(rows, chunk_size)])]
     cores = _join_cores(cloud, cores, _find_edges(cloud, labels, config, rows, chunk_size))
-    cores = _join_curved(cloud, labels, cores, mixed.on_plane)
-    split = torch.bincount(_core_regions(labels, cores), minlength=len(mixed.on_plane)) > 1
-    free = (labels >= 0) & split[labels.clamp(min=0)]
+    cores, split = _join_curved(cloud, labels, cores, mixed.on_plane)
+    free = value_of_points(split, labels, False)
     # Only points aligned with the plane show which cores it meets.
     plane_of = torch.full_like(split, UNLABELED, dtype=torch.int64)
-    plane_of[labels[on_core_plane]] = cores[on_core_plane]
-    cores = torch.where(mixed.near & free & (cores < 0), plane_of[labels.clamp(min=0)], cores)
-    unassigned = (free & (cores < 0)).nonzero().squeeze(1)
+    plane_of[labels[plane_rows]] = cores[plane_rows]
+    unassigned = nonzero_rows(mixed.near & free & (cores < 0))
+    cores[unassigned] = plane_of[labels[unassigned]]
+    unassigned = nonzero_rows(free & (cores < 0))
     cores = _propagate(cores, _find_edges(cloud, labels, config, unassigned, chunk_size))
     new = torch.where(cores >= 0, cores + len(split), UNLABELED)
     return torch.where(free, new, labels)
 
 
 def _add_plane_cores(labels: Tensor, cores: Tensor, mixed: MixedRegions) -> tuple[Tensor, Tensor]:
-    """Add the planes of regions with other cores as cores; also return a mask of their points."""
+    """Add the planes of regions with other cores as cores; also return the rows of their points."""
     has_core = torch.zeros_like(mixed.on_plane)
-    has_core[labels[cores >= 0]] = True
-    on_plane = mixed.aligned & has_core[labels.clamp(min=0)] & (labels >= 0) & (cores < 0)
-    cores = torch.where(on_plane, labels + int(cores.max()) + 1, cores)
-    return keep_regions(cores, torch.bincount(cores + 1)[1:] > 0), on_plane
+    has_core[labels[nonzero_rows(cores >= 0)]] = True
+    rows = nonzero_rows(mixed.aligned & value_of_points(has_core, labels, False) & (cores < 0))
+    cores[rows] = labels[rows] + int(cores.max()) + 1
+    return remove_small(cores, 1), rows
 
 
-def _join_curved(cloud: GrowingInput, labels: Tensor, cores: Tensor, on_plane: Tensor) -> Tensor:
-    """Merge the cores ``(N,)`` of each curved region, except its flat surfaces."""
-    segments, owner = Segments(cores, max_points=MAX_FITTED), _core_regions(labels, cores)
+def _join_curved(
+    cloud: GrowingInput, labels: Tensor, cores: Tensor, on_plane: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Merge the cores ``(N,)`` of each curved region, except its flat surfaces.
+
+    Also returns the mask of the regions ``(M,)`` with several cores.
+    """
+    segments = Segments(cores, max_points=MAX_FITTED)
+    owner, num_points = segments.first(labels), segments.sizes
     flat = ~fit_planes(segments, cloud.points, cloud.normals).curved
-    num_points = torch.bincount(cores[cores >= 0], minlength=len(owner))
-    of_region = torch.bincount(labels[labels >= 0], minlength=len(on_plane))
+    of_region = torch.bincount(labels + 1, minlength=len(on_plane) + 1)[1:]
     covered = torch.zeros_like(of_region).index_add_(0, owner, num_points * flat)
     curved = ~(on_plane | (covered >= _MIN_FLAT_FRACTION * of_region))
     is_face = flat & (num_points >= _MIN_FACE_FRACTION * of_region[owner])
     joined = curved[owner] & ~is_face
-    indices = torch.arange(len(owner) + 1, device=cores.device)
-    indices[-1] = UNLABELED
+    indices = torch.arange(len(owner), device=cores.device)
     first = torch.full_like(of_region, len(owner))
-    first.scatter_reduce_(0, owner[joined], indices[:-1][joined], "amin")
-    indices[:-1][joined] = first[owner[joined]]
-    return indices[cores]
-
-
-def _core_regions(labels: Tensor, cores: Tensor) -> Tensor:
-    """Return the region of each non-empty core, ascending."""
-    points = (cores >= 0).nonzero().squeeze(1)
-    indices, rows = torch.unique(cores[points], return_inverse=True)
-    return labels.new_zeros(len(indices)).index_copy_(0, rows, labels[points])
+    first.scatter_reduce_(0, owner[joined], indices[joined], "amin")
+    indices[joined] = first[owner[joined]]
+    split = torch.bincount(owner[indices.unique()], minlength=len(on_plane)) > 1
+    return remap_labels(cores, indices), split
 
 
 def _are_smooth(
@@ -354,9 +359,9 @@ def split_levels(
             break
         labels = torch.where(level >= 0, level + int(labels.max()) + 1, labels)
         # Only split regions are searched again.
-        rows = nonzero_rows(torch.isin(region, owner))
-        searched = torch.full_like(labels, UNLABELED)
-        searched[rows] = torch.unique(labels[rows], return_inverse=True)[1]
+        is_split = torch.bincount(owner, minlength=len(planes.normal)) > 0
+        is_searched = value_of_points(is_split, region, False)
+        searched = remove_small(torch.where(is_searched, labels, UNLABELED), 1)
     return labels
 
 
@@ -366,15 +371,17 @@ def _find_levels(
     """Return the second level of each point ``(N,)``, -1 for none, and the region of each level."""
     residual, average, noise = _measure_residuals(cloud, region, planes)
     adjacency = KnnAdjacency(cloud.neighbors)
-    limit = _SEED_NOISE_FACTOR * torch.cat([noise, noise.new_tensor([torch.inf])])
-    nearest, side = adjacency.neighbor_rows(slice(None)), 2 * region + (average > 0)
-    level = connected_points(side.where(average.abs() > limit[region], UNLABELED), nearest)
-    step = _median_steps(level, residual)
-    level = connected_points(level.where(average.abs() > step[level] / 2, UNLABELED), nearest)
-    step, owner = _median_steps(level, residual)[:-1], Segments(level).first(region)
+    nearest, level = adjacency.neighbor_rows(slice(None)), 2 * region + (average > 0)
+    limit, group = _SEED_NOISE_FACTOR * noise, region
+    for _ in range(2):
+        is_beyond = average.abs() > value_of_points(limit, group, torch.inf)
+        level = group = connected_points(level.where(is_beyond, UNLABELED), nearest)
+        segments = Segments(level)
+        step = segments.median(segments.gather(residual).abs())
+        limit = step / 2
+    owner = segments.first(region)
     min_step = (_STEP_NOISE_FACTOR * noise[owner]).clamp(min=float(config.facet_tolerance or 0.0))
-    num_points = torch.bincount(level + 1, minlength=1)[1:]
-    kept = (num_points >= int(config.min_size)) & (step >= min_step)
+    kept = (segments.counts >= int(config.min_size)) & (step >= min_step)
     level, step, owner = keep_regions(level, kept), step[kept], owner[kept]
     fits = fit_planes(Segments(level), cloud.points, cloud.normals)
     turn = unsigned_angle_deg(fits.normal, planes.normal[owner])
@@ -394,20 +401,19 @@ def _measure_residuals(
     (along,) = segments.coordinates(cloud.points, planes.center, planes.normal[:, None])
     zeros = torch.zeros(2, len(region), dtype=torch.float32, device=region.device)
     residual, average = scratch.store(zeros)
-    residual[segments.rows] = along.float()
+    residual[segments.rows] = along = along.float()
 
-    def work(block: slice) -> None:
-        rows = segments.rows[block]
-        near = Neighbors(cloud.neighbors.indices[:, :_NUM_AVERAGED]).select(rows)
+    def work(rows: slice) -> None:
+        near = Neighbors(cloud.neighbors.indices[rows, :_NUM_AVERAGED])
         same = near.gather(narrow) == narrow[rows, None]
         average[rows] = sum_neighbors(near.gather(residual) * same) / same.sum(dim=1)
 
-    map_chunks(work, len(segments.rows), ROWS_IN_CACHE, region.device)
-    floor = planes.floor.float()
-    level = segments.broadcast(_main_level(segments, segments.gather(average), floor))
-    residual[segments.rows] -= level
-    average[segments.rows] -= level
-    noise = segments.quantile(segments.gather(residual.abs()), _NOISE_QUANTILE)
+    map_chunks(work, len(region), ROWS_IN_CACHE, region.device)
+    floor, nearby = planes.floor.float(), segments.gather(average)
+    level = segments.broadcast(_main_level(segments, nearby, floor))
+    residual[segments.rows] = along = along - level
+    average[segments.rows] = nearby - level
+    noise = segments.quantile(along.abs(), _NOISE_QUANTILE)
     return residual, average, torch.maximum(_NOISE_FACTOR * noise, floor)
 
 
@@ -417,9 +423,8 @@ def _main_level(segments: Segments, average: Tensor, floor: Tensor) -> Tensor:
     offset = average - segments.broadcast(middle)
     width = torch.maximum(MAD_FACTOR * segments.median(offset.abs()), floor)
     width = torch.where(width > 0, width, 1.0)
-    bins = (
-        (2 * offset / segments.broadcast(width)).floor().clamp(-_BINS // 2, _BINS // 2 - 1).long()
-    )
+    unit = segments.broadcast(width)
+    bins = (2 * offset / unit).floor().clamp(-_BINS // 2, _BINS // 2 - 1).long()
     bins += segments.labels * _BINS + _BINS // 2
     counts = torch.bincount(bins, minlength=len(width) * _BINS).view(-1, _BINS)
     # A sum of shifted counts, because convolutions of integers exist on the CPU alone.
@@ -427,7 +432,7 @@ def _main_level(segments: Segments, average: Tensor, floor: Tensor) -> Tensor:
     window = counts.new_tensor(_WINDOW)
     peak = (padded.unfold(1, len(_WINDOW), 1) * window).sum(dim=2).argmax(dim=1)
     peak = (peak - _BINS // 2 + 0.5) * width / 2
-    near = (offset - segments.broadcast(peak)).abs() <= _PEAK_WIDTH * segments.broadcast(width)
+    near = (offset - segments.broadcast(peak)).abs() <= _PEAK_WIDTH * unit
     total = segments.sum(torch.where(near, offset, 0.0).double())
     return (middle + total / segments.sum(near.double()).clamp(min=1)).float()
 
@@ -445,13 +450,6 @@ def connected_points(groups: Tensor, nearest: Tensor) -> Tensor:
     return index.index_copy_(0, rows, _components(len(rows), *ends))
 
 
-def _median_steps(level: Tensor, residual: Tensor) -> Tensor:
-    """Return the median absolute residual of each level, plus infinity for unlabeled points."""
-    segments = Segments(level)
-    steps = segments.median(segments.gather(residual.abs()))
-    return torch.cat([steps, steps.new_tensor([torch.inf])])
-
-
 def _have_valleys(
     level: Tensor, step: Tensor, average: Tensor, region: Tensor, adjacency: KnnAdjacency
 ) -> Tensor:
@@ -463,10 +461,9 @@ def _have_valleys(
         source = owner[ring, None].expand_as(near)
         is_new = (owner[near] < 0) & (region[near] == region[ring, None])
         # If several levels reach a point, the first wins, independent of the point order.
-        target, source = near[is_new], source[is_new]
-        first = torch.full_like(owner, len(step)).scatter_reduce_(0, target, source, "amin")
-        ring = torch.unique(target)
-        owner[ring] = first[ring]
+        ring = torch.unique(near[is_new])
+        owner[ring] = len(step)
+        owner.scatter_reduce_(0, near[is_new], source[is_new], "amin")
     rows = nonzero_rows(owner >= 0)
     owner = owner[rows]
     height = average[rows] * side[owner] / step[owner]

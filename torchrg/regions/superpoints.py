@@ -162,7 +162,7 @@ def _flatten_terraces(points: Tensor, normals: Tensor, labels: Tensor) -> Tensor
     length = eigh3_lapack(fits.covariance)[0][:, 2].sqrt()
     are_flat = ~fits.curved & (fits.rms <= _MAX_RMS * length)
     reach = torch.where(are_flat, _PLANE_REACH * fits.thickness, -1.0)[plane, None]
-    offset = fits.signed_distances(points[rows], plane[:, None])
+    offset = fits.signed_distances(points[rows], plane)[:, None]
     offset = offset.where(offset.abs() <= reach, 0)
     return points.index_copy(0, rows, (points[rows] - offset * fits.normal[plane]).to(points))
 
