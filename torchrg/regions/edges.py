@@ -239,6 +239,8 @@ def are_coplanar(
     else:
         result, open_rows = mask.clone(), mask.any(dim=1)
     tested = nonzero_rows(open_rows)
+    if len(tested) == 0:
+        return result
     indices, counted = near.select(tested)
     offsets = gather_columns(cloud.points, indices)
     # |(p_j - p_i) . n_i|, below eq. (10).

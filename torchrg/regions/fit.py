@@ -145,7 +145,7 @@ def fit_planes(
 
 def mean_normals(segments: Segments, normals: Tensor) -> tuple[Tensor, Tensor]:
     """Return the mean normal of each region, up to sign, and its spread in degrees."""
-    columns = segments.gather_centered(normals, normals.new_zeros(len(segments.counts), 3).double())
+    columns = segments.gather_columns(normals)
     _, squares = segments.moments(columns, torch.ones_like(columns[0]), centered=False)
     eigenvalues, directions = eigh3_lapack(squares)
     return directions[:, :, 2], (1 - eigenvalues[:, 2]).clamp(min=0, max=1).sqrt().asin().rad2deg()

@@ -543,7 +543,7 @@ def _overshoot(
     (label, other), offset = pair, torch.zeros_like(columns[0])
     plane = planes.center[other].T, planes.normal[other].T
     for x, start, slope in zip(columns, *plane, strict=True):
-        offset += (x - start[:, None]) * slope[:, None]
+        offset += (x - start[:, None]).mul_(slope[:, None])
     offset *= inside
     total = offset.sum(dim=1)
     rounding = _ROUNDING * planes.thickness[label] * inside.sum(dim=1)
