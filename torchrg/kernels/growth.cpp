@@ -35,6 +35,7 @@ KERNEL pass_edges(int64_t num_points, int64_t num_rows, int64_t k, Floats points
   if (k > MAX_WIDTH) return TOO_WIDE;
   const float *x = points, *y = points + num_points, *z = points + 2 * num_points;
   const float *a = normals, *b = normals + num_points, *c = normals + 2 * num_points;
+  const bool has_positions = reach || max_sq_distance >= 0;
   alignas(32) float near[7][MAX_WIDTH] = {};
   alignas(32) int32_t passes[MAX_WIDTH] = {};
   for (int64_t q = 0; q < num_rows; q++, indices += k, joins += k) {
@@ -42,9 +43,13 @@ KERNEL pass_edges(int64_t num_points, int64_t num_rows, int64_t k, Floats points
     if (i < 0 || i >= num_points || !are_rows(indices, k, num_points)) return NO_SUCH_ROW;
     for (int64_t j = 0; j < k; j++) {
       const int32_t t = indices[j];
-      near[0][j] = x[t], near[1][j] = y[t], near[2][j] = z[t];
       near[3][j] = a[t], near[4][j] = b[t], near[5][j] = c[t];
-      passes[j] = -int32_t(valid[i] & valid[t] & (t != i) & (!mask || mask[q * k + j]));
+      passes[j] = -int32_t(valid[i] & valid[t] & (t != i));
+    }
+    for (int64_t j = 0; mask && j < k; j++) passes[j] &= -int32_t(mask[q * k + j]);
+    for (int64_t j = 0; has_positions && j < k; j++) {
+      const int32_t t = indices[j];
+      near[0][j] = x[t], near[1][j] = y[t], near[2][j] = z[t];
     }
     for (int64_t j = 0; reach && j < k; j++) near[6][j] = reach[indices[j]];
     for (int64_t j = 0; j < k; j += LANES) {
