@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -30,6 +30,7 @@ from torchrg.normals.orient import Orientation, choose_side, find_directions, tu
 from torchrg.regions import grow_regions, summarize_planes
 from torchrg.regions.classes import find_kinds
 from torchrg.regions.growth import needs_sampling, rank_by_count
+from torchrg.regions.repair import remap_labels
 from torchrg.regions.selection import keep_planes, selected_rows
 from torchrg.structures import UNLABELED, AnyCloud, Cloud, Neighbors, Planes, Segmentation
 from torchrg.structures.planes import Deferred
@@ -208,7 +209,7 @@ def _segment(
     )
     point_labels = expand_to_points(labels, parts.inverse, fill=UNLABELED)
     numbers = rank_by_count(point_labels)
-    labels, point_labels = (scratch.store(numbers[each]) for each in (labels, point_labels))
+    labels, point_labels = (remap_labels(each, numbers) for each in (labels, point_labels))
 
     begin("planes")
     growing = config.growing
@@ -221,12 +222,15 @@ def _segment(
     site_planes = describe(
         sites.points[parts.rows], normals, labels, neighbors=parts.surrounding, canonical=True
     )
-    fit = fit._replace(sharp=torch.zeros_like(fit.valid) if fit.sharp is None else fit.sharp)
-    found = fit.map(lambda values: scratch.store(expand_to_points(values, sites.inverse)))
+    sharp = torch.zeros_like(fit.valid) if fit.sharp is None else fit.sharp
+    found_normals, found_curvature, found_sharp, found_valid = (
+        scratch.store(expand_to_points(values, sites.inverse))
+        for values in (fit.normals, fit.curvature, sharp, fit.valid)
+    )
     planes = site_planes
     if voxel is not None:
         rows: Rows = distinct.rows if objects is None else slice(None)
-        columns = points, found.normals, point_labels
+        columns = points, found_normals, point_labels
         cloud = (scratch.store(values[rows]) for values in columns)
         table = describe(*cloud, canonical=objects is None)
         planes = replace(table, adjacency=planes.adjacency)
@@ -240,14 +244,14 @@ def _segment(
         turned = turn_faces(sites.points, fit.normals, orient, neighbors, site_labels, axes)
         return scratch.store(expand_to_points(turned, sites.inverse))
 
-    normals = choose_side(points, found.normals, *side, turn)
+    normals = choose_side(points, found_normals, *side, turn)
     begin("done")
     return Segmentation(
         point_labels,
         normals,
-        found.curvature,
-        cast(Tensor, found.sharp),
-        found.valid,
+        found_curvature,
+        found_sharp,
+        found_valid,
         planes,
         points,
         neighbors if voxel is None else None,

@@ -24,7 +24,7 @@ from torchrg.regions.adjacency import KnnAdjacency
 from torchrg.regions.edges import GrowingInput, has_late_promotion, mark_edges, neighborhood_radii
 from torchrg.regions.fit import MIN_FITTED, RegionFits, find_solid_regions
 from torchrg.regions.repair import keep_regions, merge_facets, refine_regions
-from torchrg.regions.splits import cut_bridges, find_mixed_regions, split_levels
+from torchrg.regions.splits import cut_bridges, split_levels
 from torchrg.structures import UNLABELED, AnyCloud, Neighbors
 from torchrg.structures.points import Colors, Points, Values
 
@@ -147,14 +147,13 @@ def label_regions(
     # Facets of any size can be merged into a large surface.
     fitted = min_points if config.facet_tolerance is None else min(min_points, MIN_FITTED)
     labels, fits = rank_by_size(roots, fitted), RegionFits(cloud, config)
+
+    def grow_cores(part: GrowingInput) -> Tensor:
+        return rank_by_size(grow(part, config, chunk_size), int(config.min_size))
+
     if config.cut_bridges and bool((labels >= 0).any()):
-        found = find_mixed_regions(cloud, labels, fits.get(labels), config, chunk_size)
-        if found is not None:
-            mixed, part = found
-            cores = rank_by_size(grow(part, config, chunk_size), int(config.min_size))
-            del found, part  # Its lists may be as large as those of the cloud.
-            labels = cut_bridges(cloud, labels, mixed, cores, config, chunk_size)
-            labels = rank_by_size(labels, fitted)
+        cut = cut_bridges(cloud, labels, fits.get(labels), config, chunk_size, grow_cores)
+        labels = labels if cut is labels else rank_by_size(cut, fitted)
     if config.facet_tolerance is not None and bool((labels >= 0).any()):
         contacts, planes = KnnAdjacency(cloud.neighbors).contacts(labels), fits.get(labels)
         tolerance, faceted = float(config.facet_tolerance), config.faceted is True

@@ -5,6 +5,7 @@ detects again under stricter limits yields the *cores* of :func:`cut_bridges`. T
 surfaces, such as a wall and a board on it, are separated by :func:`split_levels`.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -85,24 +86,6 @@ _BINS, _WINDOW, _PEAK_WIDTH = 64, (1, 2, 3, 2, 1), 1.5
 the half-width of the averaged peak in standard deviations."""
 
 
-class MixedRegions(NamedTuple):
-    """Non-planar regions, with at least ``min_size`` points off the plane.
-
-    Attributes:
-        rows: Points that may be of another surface, ascending, shape ``(n,)``: the points off the
-            plane if nearly all points are on it, otherwise the complete region.
-        near: Points on the plane of a region with nearly all points on it, and with a normal within
-            the maximum angle of the plane normal, shape ``(N,)``, bool.
-        aligned: Points in ``near`` with a normal within the core limits.
-        on_plane: Regions with nearly all points on one plane, shape ``(M,)``, bool.
-    """
-
-    rows: Tensor
-    near: Tensor
-    aligned: Tensor
-    on_plane: Tensor
-
-
 class _InnerEdges(NamedTuple):
     """Edges from rows ``(n,)`` to neighbors; masks: same region, and within the full limits."""
 
@@ -112,75 +95,46 @@ class _InnerEdges(NamedTuple):
     passed: Tensor
 
 
-def find_mixed_regions(
+def cut_bridges(
     cloud: GrowingInput,
     labels: Tensor,
     planes: RegionPlanes,
     config: GrowingConfig,
     chunk_size: int,
-) -> tuple[MixedRegions, GrowingInput] | None:
-    """Detect regions that may contain several surfaces; None if there are none.
-
-    Also returns their ``rows`` as a cloud with core limits; a point is valid only where the surface
-    is as smooth as is typical for the region.
-
-    ``labels`` ``(N,)`` are 0 to M-1 or :data:`torchrg.UNLABELED`, ``planes`` the planes of the
-    regions.
-    """
-    limit = _EXACT_REACH * planes.floor
-    limit = torch.where(planes.reach.isfinite(), torch.maximum(planes.reach, limit), limit)
-    distance = planes.signed_distances(cloud.points, labels).abs_()
-    off = distance > value_of_points(limit, labels, torch.inf)
-    num_off = torch.bincount(labels[nonzero_rows(off)], minlength=len(limit))
-    on_plane = num_off <= _MAX_OFF_PLANE_FRACTION * planes.num_points
-    mixed = num_off >= int(config.min_size)
-    if not bool(mixed.any()):
-        return None
-    is_partial = value_of_points(mixed & on_plane, labels, False)
-    rows = nonzero_rows(value_of_points(mixed & ~on_plane, labels, False) | (is_partial & off))
-    remaining = nonzero_rows(is_partial & ~off)
-    parts = []
-    for chunk in torch.split(remaining, ROWS_AT_ONCE):
-        ours, theirs = cloud.normals[chunk].double(), planes.normal[labels[chunk]]
-        parts.append(sq_chords(ours.unbind(dim=1), theirs.unbind(dim=1)))
-    turn = torch.cat(parts)
-    near, aligned = (
-        torch.zeros_like(off).index_fill_(0, remaining[turn <= deg_to_sq_chord(limit)], True)
-        for limit in (config.max_angle_deg, _CORE_FRACTION * config.max_angle_deg)
-    )
-    faces = _subset(cloud, labels, rows, chunk_size)
-    smooth = _are_smooth(faces, labels[rows], _SMOOTH_FRACTION * config.max_angle_deg, chunk_size)
-    faces = faces._replace(
-        valid=faces.valid & smooth,
-        reach=None if faces.reach is None else _CORE_FRACTION * faces.reach,
-        angle_fraction=_CORE_FRACTION,
-    )
-    return MixedRegions(rows, near, aligned, on_plane), faces
-
-
-def cut_bridges(
-    cloud: GrowingInput,
-    labels: Tensor,
-    mixed: MixedRegions,
-    grown: Tensor,
-    config: GrowingConfig,
-    chunk_size: int,
+    grow_cores: Callable[[GrowingInput], Tensor],
 ) -> Tensor:
     """Split regions whose surfaces are connected only by a few points.
 
-    ``grown`` ``(n,)`` are the cores in the ``rows`` of the mixed regions, 0 to C-1 or
-    :data:`torchrg.UNLABELED`. If nearly all points are on a plane, the plane is a core too. Cores
-    are one surface if a tenth of the edges between them pass the full limits, or if one plane
-    explains both. Regions with several surfaces are split: each remaining point joins the core of
-    the nearest neighbor connected by an edge, without growing through other cores. If most points
-    are in curved cores, all cores except large flat ones form one core. The returned labels may
-    have gaps.
+    Regions with ``min_size`` points off their plane are grown again under the core limits, from
+    points where the surface is as smooth as is typical for the region. ``grow_cores`` returns the
+    cores, 0 to C-1 or :data:`torchrg.UNLABELED`. If nearly all points are on a plane, only the
+    others grow, and the plane is a core too. Cores are one surface if a tenth of the edges between
+    them pass the full limits, or if one plane explains both. Regions with several surfaces are
+    split: each remaining point joins the core of the nearest neighbor connected by an edge, without
+    growing through other cores. If most points are in curved cores, all cores except large flat
+    ones form one core.
+
+    ``labels`` ``(N,)`` are 0 to M-1 or :data:`torchrg.UNLABELED`, ``planes`` the planes of the
+    regions. The returned labels may have gaps; ``labels`` itself is returned if no core grows.
     """
-    rows = mixed.rows[grown >= 0]
+    rows, others, on_plane = _find_mixed(cloud, labels, planes, int(config.min_size))
+    cores = torch.full_like(labels, UNLABELED)
+    if len(rows):
+        cores[rows] = grow_cores(_core_cloud(cloud, labels, rows, config, chunk_size))
+        rows = rows[cores[rows] >= 0]
     if len(rows) == 0:
         return labels
-    cores = torch.full_like(labels, UNLABELED).index_copy_(0, mixed.rows, grown)
-    cores, plane_rows = _add_plane_cores(labels, cores, mixed)
+    has_core = torch.zeros_like(on_plane)
+    has_core[labels[rows]] = True
+    others = others[has_core[labels[others]]]
+    turn = torch.cat(
+        [_sq_turns(cloud, labels, planes, chunk) for chunk in torch.split(others, ROWS_AT_ONCE)]
+    )
+    near = others[turn <= deg_to_sq_chord(config.max_angle_deg)]
+    # Only points aligned with the plane show which cores it meets.
+    aligned = others[turn <= deg_to_sq_chord(_CORE_FRACTION * config.max_angle_deg)]
+    cores[aligned] = labels[aligned] + int(cores.max()) + 1
+    cores = remove_small(cores, 1)
     narrow = cores.to(torch.int32)
 
     def meets_other(chunk: Tensor) -> Tensor:
@@ -189,26 +143,42 @@ def cut_bridges(
 
     rows = rows[torch.cat([meets_other(chunk) for chunk in torch.split(rows, chunk_size)])]
     cores = _join_cores(cloud, cores, _find_edges(cloud, labels, config, rows, chunk_size))
-    cores, split = _join_curved(cloud, labels, cores, mixed.on_plane)
-    free = value_of_points(split, labels, False)
-    # Only points aligned with the plane show which cores it meets.
+    cores, split = _join_curved(cloud, labels, cores, on_plane)
     plane_of = torch.full_like(split, UNLABELED, dtype=torch.int64)
-    plane_of[labels[plane_rows]] = cores[plane_rows]
-    unassigned = nonzero_rows(mixed.near & free & (cores < 0))
-    cores[unassigned] = plane_of[labels[unassigned]]
+    plane_of[labels[aligned]] = cores[aligned]
+    free = value_of_points(split, labels, False)
+    near = near[free[near] & (cores[near] < 0)]
+    cores[near] = plane_of[labels[near]]
     unassigned = nonzero_rows(free & (cores < 0))
     cores = _propagate(cores, _find_edges(cloud, labels, config, unassigned, chunk_size))
     new = torch.where(cores >= 0, cores + len(split), UNLABELED)
     return torch.where(free, new, labels)
 
 
-def _add_plane_cores(labels: Tensor, cores: Tensor, mixed: MixedRegions) -> tuple[Tensor, Tensor]:
-    """Add the planes of regions with other cores as cores; also return the rows of their points."""
-    has_core = torch.zeros_like(mixed.on_plane)
-    has_core[labels[nonzero_rows(cores >= 0)]] = True
-    rows = nonzero_rows(mixed.aligned & value_of_points(has_core, labels, False) & (cores < 0))
-    cores[rows] = labels[rows] + int(cores.max()) + 1
-    return remove_small(cores, 1), rows
+def _find_mixed(
+    cloud: GrowingInput, labels: Tensor, planes: RegionPlanes, min_size: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the points that may be of another surface, and those on a plane with such points.
+
+    The first are the points off the plane if nearly all points of the region are on it, otherwise
+    the complete region. The last value is the mask of regions ``(M,)`` with nearly all points on
+    one plane.
+    """
+    limit = _EXACT_REACH * planes.floor
+    limit = torch.where(planes.reach.isfinite(), torch.maximum(planes.reach, limit), limit)
+    distance = planes.signed_distances(cloud.points, labels).abs_()
+    off = distance > value_of_points(limit, labels, torch.inf)
+    num_off = torch.bincount(labels[nonzero_rows(off)], minlength=len(limit))
+    on_plane = num_off <= _MAX_OFF_PLANE_FRACTION * planes.num_points
+    is_partial = value_of_points((num_off >= min_size) & on_plane, labels, False)
+    is_whole = value_of_points((num_off >= min_size) & ~on_plane, labels, False)
+    return nonzero_rows(is_whole | (is_partial & off)), nonzero_rows(is_partial & ~off), on_plane
+
+
+def _sq_turns(cloud: GrowingInput, labels: Tensor, planes: RegionPlanes, rows: Tensor) -> Tensor:
+    """Return the squared chords between the normals of points and of their planes, ``(n,)``."""
+    ours, theirs = cloud.normals[rows].double(), planes.normal[labels[rows]]
+    return sq_chords(ours.unbind(dim=1), theirs.unbind(dim=1))
 
 
 def _join_curved(
@@ -250,8 +220,10 @@ def _are_smooth(
     return fractions >= _MIN_SMOOTH_RATIO * typical[regions]
 
 
-def _subset(cloud: GrowingInput, labels: Tensor, rows: Tensor, chunk_size: int) -> GrowingInput:
-    """Return a subset of points as a cloud, with neighbors limited to the same region."""
+def _core_cloud(
+    cloud: GrowingInput, labels: Tensor, rows: Tensor, config: GrowingConfig, chunk_size: int
+) -> GrowingInput:
+    """Return some points as a cloud with the core limits, and neighbors of the same region."""
     row_of = torch.full((len(labels),), -1, dtype=torch.int32, device=rows.device)
     row_of[rows] = torch.arange(len(rows), dtype=torch.int32, device=rows.device)
     narrow, local = labels.to(torch.int32), row_of[rows]
@@ -264,7 +236,13 @@ def _subset(cloud: GrowingInput, labels: Tensor, rows: Tensor, chunk_size: int) 
         same = (near.gather(narrow) == narrow[rows[chunk], None]) & (local_rows >= 0)
         counted[chunk] = same & near.mask()
         indices[chunk] = torch.where(counted[chunk], local_rows, itself)
-    return cloud.select(rows, Neighbors(indices, counted))
+    cores = cloud.select(rows, Neighbors(indices, counted))
+    smooth = _are_smooth(cores, labels[rows], _SMOOTH_FRACTION * config.max_angle_deg, chunk_size)
+    return cores._replace(
+        valid=cores.valid & smooth,
+        reach=None if cores.reach is None else _CORE_FRACTION * cores.reach,
+        angle_fraction=_CORE_FRACTION,
+    )
 
 
 def _find_edges(
