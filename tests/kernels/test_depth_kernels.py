@@ -12,7 +12,7 @@ from torchrg.depth.faces import _strip_contacts
 from torchrg.depth.growth import PixelGrid, fit_inverse_planes
 from torchrg.depth.pixels import InverseCloud
 from torchrg.linalg.moments import Segments, kth_smallest
-from torchrg.regions.extents import hull_candidates
+from torchrg.regions.extents import fit_rectangles
 from torchrg.structures.planes import PLANE_COLUMNS
 
 pytestmark = pytest.mark.skipif(not needs_library, reason="needs the library of kernels")
@@ -125,7 +125,7 @@ def test_rows_and_outer_points_of_regions_are_those_of_the_definition(most, rng)
         return [
             segments.rows,
             segments.counts,
-            *map(torch.tensor, hull_candidates(segments, *columns)),
+            *fit_rectangles(segments, *columns),
         ]
 
     found = stages()

@@ -142,9 +142,13 @@ class Segments:
         """The region of each point, in the order of :meth:`gather`."""
         return torch.repeat_interleave(self.counts, output_size=len(self.rows))
 
-    def split(self, max_points: int) -> "list[Segments]":
-        """Split into parts of complete regions, renumbered from 0, of at most ``max_points``."""
-        ends = self.counts.cumsum(0).tolist()
+    def chunks(self, max_points: int) -> "list[Segments]":
+        """Split into parts of complete regions, renumbered from 0, of at most ``max_points``.
+
+        The parts have about equal size for the threads.
+        """
+        size = max(len(self.rows) // allowed_threads() + 1, _MIN_POINTS)
+        max_points, ends = min(size, max_points), self.counts.cumsum(0).tolist()
         parts: list[Segments] = []
         region = row = 0
         while region < len(ends) or not parts:
@@ -156,11 +160,6 @@ class Segments:
             parts.append(segments)
             region, row = last, end
         return parts
-
-    def chunks(self, max_points: int) -> "list[Segments]":
-        """Split as :meth:`split`, into parts of about equal size for the threads."""
-        size = max(len(self.rows) // allowed_threads() + 1, _MIN_POINTS)
-        return self.split(min(size, max_points))
 
     def gather(self, values: Tensor) -> Tensor:
         """Gather the values of the points, region by region."""

@@ -14,8 +14,6 @@ from torchrg.linalg.moments import Segments, reduce_runs
 
 _REL_TOL = 1e-9
 """Relative area difference below which rectangles count as equal (rounding)."""
-_COMPASS = np.array([[1.0, 0], [1, 1], [0, 1], [-1, 1]])
-"""Four directions, counterclockwise; the opposite four are implied."""
 _ROUNDING = 1e-12
 """Relative margin by which a discarded point must be inside the octagon (rounding)."""
 _SIDE_TURNS = np.array([[1.5], [2.0], [2.5]])
@@ -104,35 +102,17 @@ def _hull_corners(positions: NDArray[np.float64]) -> NDArray[np.integer]:
 def hull_candidates(segments: Segments, u: Tensor, v: Tensor) -> list[NDArray[np.float64]]:
     """Return the points ``(n, 2)`` of each region that may be corners of its convex hull.
 
-    Discards points inside the octagon of the extreme points in eight directions: S. Akl, G.
-    Toussaint. A fast convex hull algorithm. Information Processing Letters 7(5), 1978.
+    The kernel discards points inside the octagon of the extreme points in eight directions: S. Akl,
+    G. Toussaint. A fast convex hull algorithm. Information Processing Letters 7(5), 1978.
     """
-    if not segments.are_served(u):
-        regions = torch.split(torch.stack([u, v], dim=1).cpu(), segments.counts.tolist())
-        return [_outside_octagon(positions.numpy().astype(np.float64)) for positions in regions]
-    (outer,) = kernels.call("hull_candidates", u, v, segments.counts, _ROUNDING)
+    u, v, counts = u.double().cpu(), v.double().cpu(), segments.counts.cpu()
+    outer = torch.ones_like(u, dtype=torch.bool)
+    if kernels.serve() and bool(counts.all()):
+        (outer,) = kernels.call("hull_candidates", u, v, counts, _ROUNDING)
     chosen = nonzero_rows(outer)
-    ends = torch.searchsorted(chosen, segments.counts.cumsum(0)).tolist()
+    ends = torch.searchsorted(chosen, counts.cumsum(0)).tolist()
     positions = torch.stack([u[chosen], v[chosen]], dim=1).numpy()
     return [positions[start:end] for start, end in zip([0, *ends], ends, strict=False)]
-
-
-def _outside_octagon(positions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Apply :func:`hull_candidates` to the points of one region."""
-    # Avoids BLAS, which would start its own threads.
-    along = _COMPASS[:, :1] * positions[:, 0] + _COMPASS[:, 1:] * positions[:, 1]
-    ends = np.concatenate([along.argmax(axis=1), along.argmin(axis=1)])
-    octagon = positions[ends[ends != np.roll(ends, 1)]]
-    if len(octagon) < 3:
-        return positions
-    edges = np.roll(octagon, -1, axis=0) - octagon
-    inward = np.stack([-edges[:, 1], edges[:, 0]], axis=1)
-    offsets = (inward * octagon).sum(axis=1)
-    rounding = _ROUNDING * np.abs(inward).max(axis=1) * np.abs(positions).max()
-    heights = inward[:, :1] * positions[:, 0] + inward[:, 1:] * positions[:, 1]
-    inside = (heights > (offsets + rounding)[:, None]).all(axis=0)
-    outside: NDArray[np.float64] = positions[~inside]
-    return outside
 
 
 class _Cells(NamedTuple):

@@ -1,8 +1,8 @@
 """Under-segmentation repair: splitting regions at bridges and at parallel levels.
 
-A bridge is a few points that connect two surfaces. Growing regions that :func:`find_mixed_regions`
-detects again under stricter limits yields the *cores* of :func:`cut_bridges`. Two parallel
-surfaces, such as a wall and a board on it, are separated by :func:`split_levels`.
+A bridge is a few points that connect two surfaces: :func:`cut_bridges` grows regions again under
+stricter limits, which yields their *cores*. Two parallel surfaces, such as a wall and a board on
+it, are separated by :func:`split_levels`.
 """
 
 from collections.abc import Callable
