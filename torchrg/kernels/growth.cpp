@@ -30,17 +30,17 @@ INLINE Flags within(Lanes values, double limit) {
 // edges.accept_edges: position and normal tests of edges to neighbors; points and normals (3, N);
 // limits below 0 are disabled.
 KERNEL pass_edges(int64_t num_points, int64_t num_rows, int64_t k, Floats points, Floats normals,
-                  Flagged valid, Floats reach, Ints indices, Flagged mask, Longs rows,
-                  double max_sq_chord, double max_sq_distance, int64_t is_signed, bool* joins) {
-  if (k > MAX_WIDTH) return TOO_WIDE;
+                  Flagged valid, Floats reach, Ints indices, Flagged mask, double max_sq_chord,
+                  double max_sq_distance, int64_t is_signed, bool* joins) {
+  if (k < 1 || k > MAX_WIDTH) return TOO_WIDE;
   const float *x = points, *y = points + num_points, *z = points + 2 * num_points;
   const float *a = normals, *b = normals + num_points, *c = normals + 2 * num_points;
   const bool has_positions = reach || max_sq_distance >= 0;
   alignas(32) float near[7][MAX_WIDTH] = {};
   alignas(32) int32_t passes[MAX_WIDTH] = {};
   for (int64_t q = 0; q < num_rows; q++, indices += k, joins += k) {
-    const int64_t i = rows[q];
-    if (i < 0 || i >= num_points || !are_rows(indices, k, num_points)) return NO_SUCH_ROW;
+    if (!are_rows(indices, k, num_points)) return NO_SUCH_ROW;
+    const int32_t i = indices[0];
     for (int64_t j = 0; j < k; j++) {
       const int32_t t = indices[j];
       near[3][j] = a[t], near[4][j] = b[t], near[5][j] = c[t];

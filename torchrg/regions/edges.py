@@ -141,7 +141,6 @@ def accept_edges(
     which tests the connectivity of the edges in a mask.
     """
     near, signed = cloud.neighbors.select(rows), cloud.signed_normals
-    ids = near.indices[:, 0].long()
     max_angle_deg = cloud.angle_fraction * config.max_angle_deg
     angle = distance = None
     if max_angle_deg < 90 or signed:
@@ -152,21 +151,21 @@ def accept_edges(
     if kernels.serve(*near, *columns, cloud.valid, cloud.reach, k=near.indices.shape[1]):
         limits = [-1.0 if limit is None else float(limit) for limit in (angle, distance)]
         (joins,) = kernels.call(
-            "pass_edges", *columns, cloud.valid, cloud.reach, *near, ids, *limits, signed
+            "pass_edges", *columns, cloud.valid, cloud.reach, *near, *limits, signed
         )
     else:
         # An edge joins two different valid points.
-        joins = near.gather(cloud.valid) & cloud.valid[ids, None] & (near.indices != ids[:, None])
-        joins &= near.mask()
+        valid = near.gather(cloud.valid)
+        joins = valid & valid[:, :1] & (near.indices != near.indices[:, :1]) & near.mask()
         if angle is not None:
-            joins &= within_angle(near, ids, columns[1], angle, signed=signed)
+            joins &= within_angle(near, columns[1], angle, signed=signed)
         if distance is not None:
-            joins &= within_distance(near, ids, columns[0], distance)
+            joins &= within_distance(near, columns[0], distance)
         if cloud.reach is not None:
-            joins &= within_reach(near, ids, *columns, cloud.reach)
+            joins &= within_reach(near, *columns, cloud.reach)
     if cloud.colors is not None:
         limit = cloud.points.new_tensor(cloud.max_color_distance**2)
-        joins &= within_distance(near, ids, cloud.colors.T, limit)
+        joins &= within_distance(near, cloud.colors.T, limit)
     connected: Tensor | None = None
     if config.coplanarity:
         if connect is not None and config.coplanarity_scope == "connected":
@@ -186,36 +185,32 @@ def accept_edges(
 
 
 def within_angle(
-    near: Neighbors, rows: Tensor, normals: Tensor, max_sq_chord: Tensor | float, *, signed: bool
+    near: Neighbors, normals: Tensor, max_sq_chord: Tensor | float, *, signed: bool
 ) -> Tensor:
     """Return a mask of neighbors whose normals ``(3, N)`` are within the angle limit, eq. (8)."""
-    ours = [column[rows][:, None] for column in normals.unbind()]
     theirs = [near.gather(column) for column in normals.unbind()]
-    return sq_chords(ours, theirs, signed=signed) <= max_sq_chord
+    return sq_chords([column[:, :1] for column in theirs], theirs, signed=signed) <= max_sq_chord
 
 
-def within_distance(
-    near: Neighbors, rows: Tensor, values: Tensor, max_sq_distance: Tensor
-) -> Tensor:
+def within_distance(near: Neighbors, values: Tensor, max_sq_distance: Tensor) -> Tensor:
     """Return a mask of neighbors whose positions or colors ``(C, N)`` are within a distance."""
     total = values.new_zeros(())
-    for column in values.unbind():
-        difference = near.gather(column) - column[rows][:, None]
+    for column in map(near.gather, values.unbind()):
+        difference = column - column[:, :1]
         total = difference.mul_(difference).add_(total)
     return total <= max_sq_distance
 
 
-def within_reach(
-    near: Neighbors, rows: Tensor, points: Tensor, normals: Tensor, reach: Tensor
-) -> Tensor:
+def within_reach(near: Neighbors, points: Tensor, normals: Tensor, reach: Tensor) -> Tensor:
     """Return a mask of edges whose ends lie within ``reach`` ``(N,)`` of each other's planes."""
     ours = theirs = points.new_zeros(())
-    for position, normal in zip(points.unbind(), normals.unbind(), strict=True):
-        offset = near.gather(position) - position[rows][:, None]
-        ours = (offset * normal[rows][:, None]).add_(ours)
-        theirs = offset.mul_(near.gather(normal)).add_(theirs)
-    on_plane = ours.abs_() <= reach[rows][:, None]
-    return on_plane & (theirs.abs_() <= near.gather(reach))
+    for column in zip(points.unbind(), normals.unbind(), strict=True):
+        position, slope = map(near.gather, column)
+        offset = position - position[:, :1]
+        ours = (offset * slope[:, :1]).add_(ours)
+        theirs = offset.mul_(slope).add_(theirs)
+    limit = near.gather(reach)
+    return (ours.abs_() <= limit[:, :1]) & (theirs.abs_() <= limit)
 
 
 def are_coplanar(

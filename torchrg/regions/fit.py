@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchrg._parallel import map_tasks
 from torchrg.config import Auto, GrowingConfig
@@ -107,13 +108,13 @@ class RegionPlanes(NamedTuple):
     def signed_distances(self, points: Tensor, regions: Tensor) -> Tensor:
         """Return signed distances ``(*, n)`` of points ``(n, 3)`` to planes of regions ``(*, n)``.
 
-        Unlabeled points, which have negative regions, have any distance.
+        It is 0 for unlabeled points, whose regions are -1.
         """
-        rows, total = regions.clamp(min=0).reshape(-1), 0.0
-        axes = zip(points.unbind(dim=1), self.center.T, self.normal.T, strict=True)
-        for column, *plane in axes:
-            # A third of the time of a gather of vectors.
-            start, slope = (part.index_select(0, rows).view(regions.shape) for part in plane)
+        rows, total = (regions + 1).reshape(-1), 0.0
+        tables = (pad(vectors.T, (1, 0)) for vectors in (self.center, self.normal))
+        for column, *plane in zip(points.unbind(dim=1), *tables, strict=True):
+            # By columns in a fourth of the time of vectors.
+            start, slope = (values.index_select(0, rows).view(regions.shape) for values in plane)
             total = (column - start).mul_(slope).add_(total)
         return total
 

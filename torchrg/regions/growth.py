@@ -151,15 +151,15 @@ def label_regions(
     def grow_cores(part: GrowingInput) -> Tensor:
         return rank_by_size(grow(part, config, chunk_size), int(config.min_size))
 
-    if config.cut_bridges and bool((labels >= 0).any()):
+    if config.cut_bridges:
         cut = cut_bridges(cloud, labels, fits.get(labels), config, chunk_size, grow_cores)
         labels = labels if cut is labels else rank_by_size(cut, fitted)
-    if config.facet_tolerance is not None and bool((labels >= 0).any()):
+    if config.facet_tolerance is not None:
         contacts, planes = KnnAdjacency(cloud.neighbors).contacts(labels), fits.get(labels)
         tolerance, faceted = float(config.facet_tolerance), config.faceted is True
         labels = merge_facets(labels, contacts, planes, tolerance=tolerance, faceted=faceted)
         labels = rank_by_size(labels, min_points)
-    if config.cut_bridges and bool((labels >= 0).any()):
+    if config.cut_bridges:
         split = split_levels(cloud, labels, fits.get(labels), config)
         labels = labels if split is labels else rank_by_size(split, 1)
     if config.absorb or config.merge_coplanar or config.max_plane_residual is not None:

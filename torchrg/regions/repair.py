@@ -66,8 +66,6 @@ def refine_regions(
     ``labels`` ``(N,)`` are 0 to M-1 or :data:`torchrg.UNLABELED`; the returned labels may have
     gaps. ``fits`` may already hold the planes of these labels.
     """
-    if not bool((labels >= 0).any()):
-        return labels
     fits, adjacency = fits or RegionFits(cloud, config), KnnAdjacency(cloud.neighbors)
     if config.max_plane_residual is not None:
         planes = fits.get(labels)

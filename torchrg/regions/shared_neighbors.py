@@ -61,18 +61,13 @@ class SharedNeighbors:
             (joined,) = kernels.call("connected", *edges)
             self._buffers.append(column_of)
             return joined
-        result = candidates.clone()
-        on_cpu = candidates.device.type == "cpu"
-        size = _BLOCK_SIZE if on_cpu else _DEVICE_BLOCK_SIZE
+        size = _BLOCK_SIZE if candidates.device.type == "cpu" else _DEVICE_BLOCK_SIZE
 
-        def test(block: slice) -> None:
-            if not on_cpu or bool(result[block].any()):
-                first = rows.start + block.start
-                shared = self._count(first, first + len(result[block]))
-                result[block] &= shared >= self._min_shared
+        def count(block: slice) -> Tensor:
+            return self._count(rows.start + block.start, rows.start + block.stop)
 
-        map_tasks(test, split_rows(len(result), size), candidates.device)
-        return result
+        shared = map_tasks(count, split_rows(len(candidates), size), candidates.device)
+        return candidates & (torch.cat(shared) >= self._min_shared)
 
     def _count(self, start: int, stop: int) -> Tensor:
         """Return the number of common neighbors along all edges of a block, shape ``(n, K)``."""

@@ -139,7 +139,7 @@ def cut_bridges(
 
     def meets_other(chunk: Tensor) -> Tensor:
         near = cloud.neighbors.gather(narrow, chunk)
-        return ((near >= 0) & (near != narrow[chunk, None])).any(dim=1)
+        return ((near >= 0) & (near != near[:, :1])).any(dim=1)
 
     rows = rows[torch.cat([meets_other(chunk) for chunk in torch.split(rows, chunk_size)])]
     cores = _join_cores(cloud, cores, _find_edges(cloud, labels, config, rows, chunk_size))
@@ -209,10 +209,10 @@ def _are_smooth(
 ) -> Tensor:
     """Return a mask of points where the surface is as smooth as is typical for its region."""
     fractions = torch.zeros_like(cloud.curvature, dtype=torch.float64)
-    rows, limit = torch.arange(len(regions), device=regions.device), deg_to_sq_chord(max_angle_deg)
+    limit = deg_to_sq_chord(max_angle_deg)
     for chunk in split_rows(len(fractions), chunk_size):
         near, counted = cloud.neighbors.select(chunk), cloud.neighbors.mask(chunk)
-        smooth = within_angle(near, rows[chunk], cloud.normals.T, limit, signed=False) & counted
+        smooth = within_angle(near, cloud.normals.T, limit, signed=False) & counted
         fractions[chunk] = smooth.sum(dim=1).double() / counted.sum(dim=1).clamp(min=1)
     regions = torch.unique(regions, return_inverse=True)[1]
     segments = Segments(regions)
@@ -233,8 +233,7 @@ def _core_cloud(
     for chunk in split_rows(len(rows), chunk_size):
         near, itself = cloud.neighbors.select(rows[chunk]), local[chunk, None]
         local_rows = near.gather(row_of)
-        same = (near.gather(narrow) == narrow[rows[chunk], None]) & (local_rows >= 0)
-        counted[chunk] = same & near.mask()
+        counted[chunk] = _in_region(near, narrow) & (local_rows >= 0)
         indices[chunk] = torch.where(counted[chunk], local_rows, itself)
     cores = cloud.select(rows, Neighbors(indices, counted))
     smooth = _are_smooth(cores, labels[rows], _SMOOTH_FRACTION * config.max_angle_deg, chunk_size)
@@ -255,9 +254,16 @@ def _find_edges(
     for chunk in split_rows(len(rows), chunk_size):
         near = cloud.neighbors.select(rows[chunk])
         targets[chunk] = near.indices
-        inside[chunk] = (near.gather(narrow) == narrow[rows[chunk], None]) & near.mask()
+        inside[chunk] = _in_region(near, narrow)
         passed[chunk] = accept_edges(cloud, config, rows[chunk], None)[0] & inside[chunk]
     return _InnerEdges(rows, targets, inside, passed)
+
+
+def _in_region(near: Neighbors, labels: Tensor) -> Tensor:
+    """Return a mask of the neighbors in the region of their point, shape ``(n, K)``."""
+    theirs = near.gather(labels)
+    same = theirs == theirs[:, :1]
+    return same if near.valid is None else same & near.valid
 
 
 def _join_cores(cloud: GrowingInput, cores: Tensor, edges: _InnerEdges) -> Tensor:
@@ -383,7 +389,7 @@ def _measure_residuals(
 
     def work(rows: slice) -> None:
         near = Neighbors(cloud.neighbors.indices[rows, :_NUM_AVERAGED])
-        same = near.gather(narrow) == narrow[rows, None]
+        same = _in_region(near, narrow)
         average[rows] = sum_neighbors(near.gather(residual) * same) / same.sum(dim=1)
 
     map_chunks(work, len(region), ROWS_IN_CACHE, region.device)

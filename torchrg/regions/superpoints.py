@@ -23,6 +23,7 @@ from torchrg.regions.adjacency import NUM_CONTACTS, KnnAdjacency
 from torchrg.regions.edges import neighborhood_radii
 from torchrg.regions.fit import fit_planes, mean_normals
 from torchrg.regions.growth import rank_by_count
+from torchrg.regions.repair import value_of_points
 from torchrg.regions.splits import connected_points
 from torchrg.robust.lanes import sum_products, sum_squares
 from torchrg.structures import UNLABELED, Neighbors, Sampling, Superpoints
@@ -154,17 +155,21 @@ def _measure(points: Tensor, neighbors: Neighbors | None) -> Sampling:
 
 def _flatten_terraces(points: Tensor, normals: Tensor, labels: Tensor) -> Tensor:
     """Return points ``(n, 3)`` projected onto the plane of their label, if this is flat."""
-    rows = nonzero_rows(labels >= 0)
-    if len(rows) == 0:
-        return points
-    plane = torch.unique(labels[rows], return_inverse=True)[1]
-    fits = fit_planes(Segments(plane), points[rows], normals[rows])
+    plane = _number_planes(labels)
+    fits = fit_planes(Segments(plane), points, normals)
     length = eigh3_lapack(fits.covariance)[0][:, 2].sqrt()
     are_flat = ~fits.curved & (fits.rms <= _MAX_RMS * length)
-    reach = torch.where(are_flat, _PLANE_REACH * fits.thickness, -1.0)[plane, None]
-    offset = fits.signed_distances(points[rows], plane)[:, None]
+    reach = value_of_points(torch.where(are_flat, _PLANE_REACH * fits.thickness, -1.0), plane, -1.0)
+    offset = fits.signed_distances(points, plane)
     offset = offset.where(offset.abs() <= reach, 0)
-    return points.index_copy(0, rows, (points[rows] - offset * fits.normal[plane]).to(points))
+    slopes = (value_of_points(column, plane, 0.0) for column in fits.normal.unbind(dim=1))
+    return (points - torch.stack([offset * slope for slope in slopes], dim=1)).to(points)
+
+
+def _number_planes(labels: Tensor) -> Tensor:
+    """Return plane IDs ``(n,)`` as consecutive numbers, -1 if unlabeled."""
+    values, numbers = torch.unique(labels.clamp(min=UNLABELED), return_inverse=True)
+    return numbers - int(torch.count_nonzero(values < 0))
 
 
 def merge_duplicates(
@@ -241,17 +246,13 @@ def _partition_distinct(
 
 def _blend_with_planes(normals: Tensor, labels: Tensor) -> Tensor:
     """Return normals halfway between the point normal and the plane normal of flat planes."""
-    rows = (labels >= 0).nonzero().squeeze(1)
-    if len(rows) == 0:
-        return normals
-    plane = torch.unique(labels[rows], return_inverse=True)[1]
-    inputs = normals[rows].double()
+    plane, inputs = _number_planes(labels), normals.double()
     axes, spread = mean_normals(Segments(plane), inputs)
-    flat = spread <= _MAX_SPREAD_DEG
-    shared = torch.where(flat[:, None], axes, 0.0)[plane]
+    rows = nonzero_rows(value_of_points(spread <= _MAX_SPREAD_DEG, plane, False))
+    shared, inputs = axes[plane[rows]], inputs[rows]
     shared = torch.where((inputs * shared).sum(dim=1, keepdim=True) < 0, -shared, shared)
     blended = functional.normalize(torch.lerp(inputs, shared, _PLANE_FRACTION), dim=1)
-    return normals.index_copy(0, rows, torch.where(flat[plane, None], blended, inputs).to(normals))
+    return normals.index_copy(0, rows, blended.to(normals))
 
 
 def _mesh_edges(faces: Tensor, positions: Tensor) -> Tensor:
