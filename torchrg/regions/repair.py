@@ -409,20 +409,22 @@ def refine_borders(
     which are left unchanged.
     """
     flat = torch.cat([reach.isfinite(), reach.new_ones(1, dtype=torch.bool)])
-    return _reassign(cloud, labels, flat, partial(_choose_regions, cloud, planes, reach))
+    return _reassign(cloud, labels, planes, flat, partial(_choose_regions, cloud, planes, reach))
 
 
 def _reassign(
     cloud: GrowingInput,
     labels: Tensor,
+    planes: RegionPlanes,
     movable: Tensor,
-    choose: Callable[[Tensor, Tensor, Tensor], Tensor],
+    choose: Callable[[Tensor, Tensor, Tensor, Tensor], Tensor],
 ) -> Tensor:
     """Reassign boundary points; changed points and their neighbors are revisited.
 
-    ``choose`` returns new labels, given all labels, the rows ``(n,)`` of points, and the rows of
-    their 8 nearest neighbors ``(8, n)``. Only valid points of ``movable`` regions are passed, ``(M
-    + 1,)``, the last entry for unlabeled points.
+    ``choose`` returns new labels ``(n,)``, given all labels, and the rows of points and of their 8
+    nearest neighbors ``(9, n)``, their labels, and the distances of the points to these planes.
+    Only valid points of ``movable`` regions are passed, ``(M + 1,)``, the last entry for unlabeled
+    points.
     """
     adjacency = KnnAdjacency(cloud.neighbors)
     # int32 is faster to index and to compare.
@@ -433,7 +435,10 @@ def _reassign(
         near = adjacency.neighbor_rows(rows)
 
         def work(block: slice, rows: Tensor = rows, near: Tensor = near) -> Tensor:
-            return choose(labels, rows[block], near[block].T)
+            group = torch.cat([rows[block][None], near[block].T])
+            options = Neighbors(group).gather(labels)
+            distance = planes.signed_distances(cloud.points[rows[block]], options).abs_()
+            return choose(labels, group, options, distance)
 
         chosen = torch.cat(map_chunks(work, len(rows), ROWS_IN_CACHE, labels.device))
         moved = chosen != labels[rows]
@@ -455,20 +460,17 @@ def assign_levels(cloud: GrowingInput, labels: Tensor, planes: RegionPlanes) -> 
     flat = ~planes.curved & (planes.num_points >= MIN_FITTED)
     flat = torch.cat([flat, flat.new_zeros(1)])
 
-    def choose(labels: Tensor, rows: Tensor, near: Tensor) -> Tensor:
-        label, options = labels.index_select(0, rows), Neighbors(near).gather(labels)
-        every = torch.cat([label[None], options])
-        distance = planes.signed_distances(cloud.points[rows], every).abs_()
-        usable = (distance[1:] < distance[0]) & flat[options] & (options != label)
-        open_rows = nonzero_rows(usable.any(dim=0))
-        options, usable = options[:, open_rows], usable[:, open_rows]
-        turn = unsigned_angle_deg(planes.normal[options], planes.normal[label[open_rows]])
-        cost = torch.where(usable & (turn <= PARALLEL_DEG), distance[1:, open_rows], torch.inf)
-        other, min_cost = _lowest(cost, options)
+    def choose(labels: Tensor, group: Tensor, options: Tensor, distance: Tensor) -> Tensor:
+        label, usable = options[0], (distance < distance[0]) & flat[options]
+        both = nonzero_rows(usable.any(dim=0))
+        options = options[:, both]
+        turn = unsigned_angle_deg(planes.normal[options], planes.normal[options[0]])
+        usable = usable[:, both] & (turn <= PARALLEL_DEG)
+        other, min_cost = _lowest(torch.where(usable, distance[:, both], torch.inf), options)
         found = nonzero_rows(min_cost.isfinite())
-        both, other = open_rows[found], other[found]
+        both, other = both[found], other[found]
         pair = torch.stack([label[both], other], dim=1)
-        group = torch.cat([rows[None], near])[:, both].T.contiguous()
+        group = group[:, both].T.contiguous()
         members = (labels[group][:, :, None] == pair[:, None]).any(dim=2, keepdim=True)
         normal, center = planes.normal[pair], planes.center[pair]
         normal = torch.where((normal[:, :1] * normal).sum(dim=2, keepdim=True) < 0, -normal, normal)
@@ -481,7 +483,7 @@ def assign_levels(cloud: GrowingInput, labels: Tensor, planes: RegionPlanes) -> 
         moved &= offset[:, 0, 1].abs() <= _LEVEL_REACH * planes.thickness[other]
         return label.index_copy(0, both[moved], other[moved])
 
-    return _reassign(cloud, labels, flat, choose)
+    return _reassign(cloud, labels, planes, flat, choose)
 
 
 def _choose_regions(
@@ -489,13 +491,12 @@ def _choose_regions(
     planes: RegionPlanes,
     reach: Tensor,
     labels: Tensor,
-    rows: Tensor,
-    near: Tensor,
+    group: Tensor,
+    options: Tensor,
+    distance: Tensor,
 ) -> Tensor:
-    """Choose a region for each of ``rows`` among its label and those of ``near`` ``(8, n)``."""
-    label, position = labels.index_select(0, rows), cloud.points[rows]
-    options = torch.cat([label[None], Neighbors(near).gather(labels)])
-    distance = planes.signed_distances(position, options).abs_()
+    """Choose a region for each point among the ``options`` ``(9, n)``; see :func:`_reassign`."""
+    label, rows = options[0], group[0]
     usable = distance <= value_of_points(reach, options, torch.nan)
     cost = (distance / value_of_points(planes.thickness, options, 1.0)).square()
     cost = torch.where(usable, cost + _ROUNDING**2 * (options != label), torch.inf)
@@ -507,8 +508,8 @@ def _choose_regions(
     choice = torch.where(remains, label, first)
 
     both = nonzero_rows(second_cost.isfinite() & ~remains)
-    label, position, pair = label[both], position[both], (first[both], second[both])
-    lists = cloud.neighbors.select(rows[both])
+    rows, label, pair = rows[both], label[both], (first[both], second[both])
+    position, lists = cloud.points[rows], cloud.neighbors.select(rows)
     members = torch.where(lists.mask(), lists.gather(labels), UNLABELED)
     columns = [lists.gather(column).double() for column in cloud.points.unbind(dim=1)]
     # A rounded edge is as far from a precise plane as from a rough one: both have one unit.

@@ -6,7 +6,6 @@ it, are separated by :func:`split_levels`.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -86,15 +85,6 @@ _BINS, _WINDOW, _PEAK_WIDTH = 64, (1, 2, 3, 2, 1), 1.5
 the half-width of the averaged peak in standard deviations."""
 
 
-class _InnerEdges(NamedTuple):
-    """Edges from rows ``(n,)`` to neighbors; masks: same region, and within the full limits."""
-
-    rows: Tensor
-    targets: Tensor
-    inside: Tensor
-    passed: Tensor
-
-
 def cut_bridges(
     cloud: GrowingInput,
     labels: Tensor,
@@ -142,7 +132,7 @@ def cut_bridges(
         return ((near >= 0) & (near != near[:, :1])).any(dim=1)
 
     rows = rows[torch.cat([meets_other(chunk) for chunk in torch.split(rows, chunk_size)])]
-    cores = _join_cores(cloud, cores, _find_edges(cloud, labels, config, rows, chunk_size))
+    cores = _join_cores(cloud, cores, *_find_edges(cloud, labels, config, rows, chunk_size))
     cores, split = _join_curved(cloud, labels, cores, on_plane)
     plane_of = torch.full_like(split, UNLABELED, dtype=torch.int64)
     plane_of[labels[aligned]] = cores[aligned]
@@ -150,7 +140,7 @@ def cut_bridges(
     near = near[free[near] & (cores[near] < 0)]
     cores[near] = plane_of[labels[near]]
     unassigned = nonzero_rows(free & (cores < 0))
-    cores = _propagate(cores, _find_edges(cloud, labels, config, unassigned, chunk_size))
+    cores = _propagate(cores, *_find_edges(cloud, labels, config, unassigned, chunk_size))
     new = torch.where(cores >= 0, cores + len(split), UNLABELED)
     return torch.where(free, new, labels)
 
@@ -246,17 +236,16 @@ def _core_cloud(
 
 def _find_edges(
     cloud: GrowingInput, labels: Tensor, config: GrowingConfig, rows: Tensor, chunk_size: int
-) -> _InnerEdges:
-    """Return the edges of the given points."""
+) -> tuple[Neighbors, Tensor]:
+    """Return the neighbors of points in their region, and which edges pass the full limits."""
     shape, narrow = (len(rows), cloud.neighbors.indices.shape[1]), labels.to(torch.int32)
-    targets = scratch.new_empty(cloud.neighbors.indices, shape)
+    indices = scratch.new_empty(cloud.neighbors.indices, shape)
     inside, passed = (scratch.new_empty(cloud.valid, shape) for _ in range(2))
     for chunk in split_rows(len(rows), chunk_size):
         near = cloud.neighbors.select(rows[chunk])
-        targets[chunk] = near.indices
-        inside[chunk] = _in_region(near, narrow)
+        indices[chunk], inside[chunk] = near.indices, _in_region(near, narrow)
         passed[chunk] = accept_edges(cloud, config, rows[chunk], None)[0] & inside[chunk]
-    return _InnerEdges(rows, targets, inside, passed)
+    return Neighbors(indices, inside), passed
 
 
 def _in_region(near: Neighbors, labels: Tensor) -> Tensor:
@@ -266,18 +255,17 @@ def _in_region(near: Neighbors, labels: Tensor) -> Tensor:
     return same if near.valid is None else same & near.valid
 
 
-def _join_cores(cloud: GrowingInput, cores: Tensor, edges: _InnerEdges) -> Tensor:
+def _join_cores(cloud: GrowingInput, cores: Tensor, near: Neighbors, passed: Tensor) -> Tensor:
     """Return the cores ``(N,)`` with cores of one surface merged."""
-    num_cores = int(cores.max()) + 1
-    narrow = cores.to(torch.int32)
-    ours, theirs = narrow[edges.rows, None], Neighbors(edges.targets).gather(narrow)
-    between = edges.inside & (theirs >= 0) & (theirs != ours)
-    first, second = ours.expand_as(theirs)[between].long(), theirs[between].long()
+    num_cores, theirs = int(cores.max()) + 1, near.gather(cores)
+    ours = theirs[:, :1].expand_as(theirs)
+    between = near.mask() & (theirs >= 0) & (theirs != ours)
+    first, second = ours[between], theirs[between]
     keys = torch.minimum(first, second) * num_cores + torch.maximum(first, second)
     keys, indices = torch.unique(keys, return_inverse=True)
     pairs = torch.stack([keys // num_cores, keys % num_cores], dim=1)
     num_edges = torch.bincount(indices, minlength=len(pairs))
-    num_open = torch.bincount(indices[edges.passed[between]], minlength=len(pairs))
+    num_open = torch.bincount(indices[passed[between]], minlength=len(pairs))
     planes = fit_planes(Segments(cores, max_points=MAX_FITTED), cloud.points, cloud.normals)
     turn = unsigned_angle_deg(*planes.normal[pairs].unbind(dim=1))
     joined = (pairwise_misfit(planes, pairs) < _MAX_MISFIT) & (turn <= _MAX_DIHEDRAL_DEG)
@@ -296,18 +284,18 @@ def _components(num_nodes: int, first: Tensor, second: Tensor) -> Tensor:
     return torch.from_numpy(owner).to(first.device, torch.int64)
 
 
-def _propagate(cores: Tensor, edges: _InnerEdges) -> Tensor:
+def _propagate(cores: Tensor, near: Neighbors, passed: Tensor) -> Tensor:
     """Assign points between cores to the core of the nearest neighbor they have an edge to."""
-    cores = cores.clone()
-    unassigned = torch.arange(len(edges.rows), device=cores.device)
+    cores, rows = cores.clone(), near.indices[:, 0].long()
+    unassigned = torch.arange(len(rows), device=cores.device)
     while len(unassigned):
-        targets = edges.targets[unassigned].long()
-        connected = edges.passed[unassigned] & (cores[targets] >= 0)
+        owner = near.gather(cores, unassigned)
+        connected = passed[unassigned] & (owner >= 0)
         nearest = connected.to(torch.uint8).argmax(dim=1, keepdim=True)
         joined = connected.any(dim=1)
         if not bool(joined.any()):
             break
-        cores[edges.rows[unassigned[joined]]] = cores[targets.gather(1, nearest).squeeze(1)][joined]
+        cores[rows[unassigned[joined]]] = owner.gather(1, nearest).squeeze(1)[joined]
         unassigned = unassigned[~joined]
     return cores
 
