@@ -130,7 +130,8 @@ class KnnAdjacency:
         num_points = len(self.neighbors.indices)
         is_changed = torch.zeros(num_points, dtype=torch.bool, device=candidates.device)
         is_changed[changed] = True
-        return candidates[is_changed[self.neighbor_rows(candidates)].any(dim=1)]
+        near = Neighbors(self.neighbor_rows(candidates))
+        return candidates[near.gather(is_changed).any(dim=1)]
 
     def contacts(self, labels: Tensor) -> tuple[Tensor, Tensor]:
         """Apply :func:`find_region_pairs` to the nearest neighbors."""
@@ -181,8 +182,8 @@ class _RegionEdges:
         if self._num_regions**2 <= len(labels):
             # A table of all pairs is faster than a sort.
             table = torch.bincount(keys)
-            keys, self._index = nonzero_rows(table), ((table > 0).cumsum(0) - 1).__getitem__
-            self.counts = table[keys]
+            keys, ranks = nonzero_rows(table), (table > 0).cumsum(0) - 1
+            self.counts, self._index = table[keys], partial(torch.index_select, ranks, 0)
         else:
             keys, self.counts = torch.unique(keys, return_counts=True)
             self._index = partial(torch.searchsorted, keys)
@@ -192,7 +193,7 @@ class _RegionEdges:
         """Return end points and columns of the edges of points, and the keys of their pairs."""
         low, high, _ = self._columns.indices(self._neighbors.indices.shape[1])
         width = max(high - low, 1)
-        if _are_served(self._labels, self._neighbors):
+        if kernels.serve(self._labels, *self._neighbors):
             where = self._labels, *self._neighbors, rows, low, high, self._num_regions
             *edges, count = kernels.call("crossing_edges", *where)
             scratch.release()
@@ -218,24 +219,17 @@ class _RegionEdges:
             yield from map_tasks(find, chunks[batch], self._rows.device)
 
 
-def _are_served(labels: Tensor, neighbors: Neighbors) -> bool:
-    """Return whether kernels support lists, which they must not copy for each chunk of rows."""
-    present = [part for part in neighbors if part is not None]
-    return kernels.serve(labels, *present) and all(part.is_contiguous() for part in present)
-
-
 def _boundary_rows(rows: Tensor, labels: Tensor, neighbors: Neighbors, columns: slice) -> Tensor:
     """Return which of the rows have a neighbor in another region; all of them are int32."""
     low, high, _ = columns.indices(neighbors.indices.shape[1])
-    is_served = _are_served(labels, neighbors)
 
     def mark(chunk: slice) -> Tensor:
         part = rows[chunk]
-        if is_served:
+        if kernels.serve(labels, *neighbors):
             return kernels.call("mark_boundary", labels, *neighbors, part, low, high)[0]
         return _crosses(labels, part, neighbors.select(part), columns).any(dim=1)
 
-    at_once = ROWS_AT_ONCE if is_served else limit_rows(ROWS_IN_CACHE, neighbors.indices.shape[1])
+    at_once = limit_rows(ROWS_AT_ONCE, neighbors.indices.shape[1])
     meets = torch.cat(map_chunks(mark, len(rows), at_once, labels.device))
     return rows.index_select(0, nonzero_rows(meets))
 
@@ -251,7 +245,7 @@ def _crosses(labels: Tensor, rows: Rows, near: Neighbors, columns: slice) -> Ten
 
 def _select(contacts: _Contacts, chosen: Tensor) -> _Contacts:
     """Return the selected edges."""
-    rows = chosen.nonzero().squeeze(1)
+    rows = nonzero_rows(chosen)
     return _Contacts(*(values.index_select(0, rows) for values in contacts))
 
 

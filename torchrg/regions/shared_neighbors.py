@@ -14,9 +14,6 @@ _BLOCK_SIZE = 64
 matrix products."""
 _DEVICE_BLOCK_SIZE = 2048
 """The same on other devices, which wait for each block; matrices of some 3,000 members, 40 MB."""
-_MAX_IN_KERNEL = kernels.MAX_NEIGHBORS // 8
-"""Maximum number of neighbors for which the kernel is faster: a block of the kernel has at most
-eight times this number of members."""
 
 
 def min_shared_neighbors(connectivity: float, k: int) -> int:
@@ -51,8 +48,7 @@ class SharedNeighbors:
         """
         if self._min_shared <= 0:
             return candidates.clone()
-        k = candidates.shape[1]
-        if k <= _MAX_IN_KERNEL and kernels.serve(*self._neighbors, candidates, k=k):
+        if kernels.serve(*self._neighbors, candidates, k=candidates.shape[1]):
             try:
                 column_of = self._buffers.pop()
             except IndexError:
