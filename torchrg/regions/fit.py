@@ -110,12 +110,12 @@ class RegionPlanes(NamedTuple):
 
         It is 0 for unlabeled points, whose regions are -1.
         """
-        rows, total = (regions + 1).reshape(-1), 0.0
+        rows, total = (regions + 1).reshape(-1), torch.zeros_like(regions, dtype=self.center.dtype)
         tables = (pad(vectors.T, (1, 0)) for vectors in (self.center, self.normal))
         for column, *plane in zip(points.unbind(dim=1), *tables, strict=True):
             # By columns in a fourth of the time of vectors.
             start, slope = (values.index_select(0, rows).view(regions.shape) for values in plane)
-            total = (column - start).mul_(slope).add_(total)
+            total += (column - start).mul_(slope)
         return total
 
 

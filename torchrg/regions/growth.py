@@ -210,10 +210,11 @@ def checked_cloud(
         residual_rms = residual_rms.to(positions)
         floor = config.coplanarity_floor * neighborhood_radii(positions, neighbors)
         reach = torch.where(residual_rms > floor, config.plane_reach * residual_rms, torch.inf)
-    finite = normals.isfinite().all(dim=1) & curvature.isfinite()
-    valid = finite if valid is None else finite & valid
-    columns = to_column_major(positions), to_column_major(normals)
-    return GrowingInput(*columns, curvature, neighbors, valid, reach)
+    positions, normals = to_column_major(positions), to_column_major(normals)
+    valid = curvature.isfinite() if valid is None else curvature.isfinite() & valid
+    for column in normals.unbind(dim=1):
+        valid &= column.isfinite()
+    return GrowingInput(positions, normals, curvature, neighbors, valid, reach)
 
 
 def _add_colors(cloud: GrowingInput, colors: Colors | None, max_distance: float) -> GrowingInput:

@@ -503,8 +503,9 @@ def _choose_regions(
     first, first_cost = _lowest(cost, options)
     second, second_cost = _lowest(torch.where(options == first, torch.inf, cost), options)
     # Beyond the reach of its region, a point keeps the label of growth unless another is nearer.
-    is_nearest = torch.where(usable, distance, torch.inf).amin(dim=0) >= distance[0]
-    remains = ((label >= 0) & ~usable[0] & is_nearest) | first_cost.isinf()
+    remains, away = first_cost.isinf(), nonzero_rows((label >= 0) & ~usable[0])
+    others = torch.where(usable[:, away], distance[:, away], torch.inf)
+    remains[away] |= others.amin(dim=0) >= distance[0, away]
     choice = torch.where(remains, label, first)
 
     both = nonzero_rows(second_cost.isfinite() & ~remains)

@@ -190,7 +190,7 @@ def _join_curved(
     first = torch.full_like(of_region, len(owner))
     first.scatter_reduce_(0, owner[joined], indices[joined], "amin")
     indices[joined] = first[owner[joined]]
-    split = torch.bincount(owner[indices.unique()], minlength=len(on_plane)) > 1
+    split = torch.bincount(owner[torch.unique(indices)], minlength=len(on_plane)) > 1
     return remap_labels(cores, indices), split
 
 

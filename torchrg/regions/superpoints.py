@@ -169,7 +169,8 @@ def _flatten_terraces(points: Tensor, normals: Tensor, labels: Tensor) -> Tensor
 def _number_planes(labels: Tensor) -> Tensor:
     """Return plane IDs ``(n,)`` as consecutive numbers, -1 if unlabeled."""
     values, numbers = torch.unique(labels.clamp(min=UNLABELED), return_inverse=True)
-    return numbers - int(torch.count_nonzero(values < 0))
+    consecutive: Tensor = numbers - int(torch.count_nonzero(values < 0))
+    return consecutive
 
 
 def merge_duplicates(
