@@ -190,3 +190,17 @@ def test_a_value_of_a_rank_is_that_of_sorted_values(kind, rng):
         for rank in {0, 1, len(numbers) // 2, len(numbers) - 1}:
             found = kth_smallest(numbers, rank)
             torch.testing.assert_close(found, expected[rank], rtol=0, atol=0, equal_nan=True)
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.33, 0.5, 1.0])
+def test_quantiles_of_regions_are_those_of_the_definition(fraction, rng):
+    labels = torch.randint(-1, 40, (900,), generator=rng)
+    labels[labels == 7] = 8  # A region without points.
+    values = torch.randn(900, generator=rng)
+    values[::50] = torch.nan
+    segments = Segments(labels)
+    for numbers in (values, values.double()):
+        found = segments.quantile(segments.gather(numbers), fraction)
+        with definitions():
+            assert_same([found], [segments.quantile(segments.gather(numbers), fraction)])
+        assert found[7].isnan()

@@ -237,7 +237,8 @@ def test_a_thin_side_is_no_facet_of_the_face_beside_it():
     labels = (order >= 3000).long()
     contacts = KnnAdjacency(cloud.neighbors).contacts(labels)
     planes = fit_regions(cloud, labels, OFF)
-    assert len(merge_facets(labels, contacts, planes, tolerance=0.009).unique()) == 2
+    config = with_settings(facet_tolerance=0.009, faceted=True)
+    assert len(merge_facets(labels, contacts, planes, config).unique()) == 2
 
 
 @pytest.mark.parametrize(
@@ -256,7 +257,9 @@ def test_a_plane_across_a_step_does_not_explain_the_boards_beside_it(step, facet
     across = both @ np.linalg.svd(both, full_matrices=False)[2][2]
     is_near = np.sqrt(np.mean(across**2)) < 0.009
     assert is_near == (step < 0.06)
-    found = merge_facets(labels, contacts, planes, tolerance=0.009, faceted=faceted)
+    found = merge_facets(
+        labels, contacts, planes, with_settings(facet_tolerance=0.009, faceted=faceted)
+    )
     assert len(found.unique()) == faces
 
 
@@ -275,7 +278,8 @@ def test_a_warp_bends_a_face_and_the_two_sides_of_a_plate_stay_two(thickness, wa
     labels = torch.from_numpy(left)[order].long()
     planes = fit_regions(cloud._replace(reach=torch.full((3000,), reach)), labels, OFF)
     contacts = torch.tensor([[0, 1]]), torch.tensor([MIN_CONTACTS])
-    assert len(merge_facets(labels, contacts, planes, tolerance=0.03).unique()) == faces
+    config = with_settings(facet_tolerance=0.03, faceted=True)
+    assert len(merge_facets(labels, contacts, planes, config).unique()) == faces
 
 
 def scattered(rng, count, angle_deg):

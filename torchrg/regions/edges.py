@@ -142,30 +142,25 @@ def accept_edges(
     """
     near, signed = cloud.neighbors.select(rows), cloud.signed_normals
     max_angle_deg = cloud.angle_fraction * config.max_angle_deg
-    angle = distance = None
-    if max_angle_deg < 90 or signed:
-        angle = cloud.points.new_tensor(deg_to_sq_chord(max_angle_deg))
-    if config.max_distance is not None:
-        distance = cloud.points.new_tensor(config.max_distance**2)
+    # Negative limits are disabled.
+    angle = deg_to_sq_chord(max_angle_deg) if max_angle_deg < 90 or signed else -1.0
+    distance = -1.0 if config.max_distance is None else config.max_distance**2
     columns = cloud.points.T, cloud.normals.T
     if kernels.serve(*near, *columns, cloud.valid, cloud.reach, k=near.indices.shape[1]):
-        limits = [-1.0 if limit is None else float(limit) for limit in (angle, distance)]
-        (joins,) = kernels.call(
-            "pass_edges", *columns, cloud.valid, cloud.reach, *near, *limits, signed
-        )
+        where = *columns, cloud.valid, cloud.reach, *near
+        (joins,) = kernels.call("pass_edges", *where, angle, distance, signed)
     else:
         # An edge joins two different valid points.
         valid = near.gather(cloud.valid)
         joins = valid & valid[:, :1] & (near.indices != near.indices[:, :1]) & near.mask()
-        if angle is not None:
+        if angle >= 0:
             joins &= within_angle(near, columns[1], angle, signed=signed)
-        if distance is not None:
+        if distance >= 0:
             joins &= within_distance(near, columns[0], distance)
         if cloud.reach is not None:
             joins &= within_reach(near, *columns, cloud.reach)
     if cloud.colors is not None:
-        limit = cloud.points.new_tensor(cloud.max_color_distance**2)
-        joins &= within_distance(near, cloud.colors.T, limit)
+        joins &= within_distance(near, cloud.colors.T, cloud.max_color_distance**2)
     connected: Tensor | None = None
     if config.coplanarity:
         if connect is not None and config.coplanarity_scope == "connected":
@@ -184,15 +179,13 @@ def accept_edges(
     return joins, connected
 
 
-def within_angle(
-    near: Neighbors, normals: Tensor, max_sq_chord: Tensor | float, *, signed: bool
-) -> Tensor:
+def within_angle(near: Neighbors, normals: Tensor, max_sq_chord: float, *, signed: bool) -> Tensor:
     """Return a mask of neighbors whose normals ``(3, N)`` are within the angle limit, eq. (8)."""
     theirs = [near.gather(column) for column in normals.unbind()]
     return sq_chords([column[:, :1] for column in theirs], theirs, signed=signed) <= max_sq_chord
 
 
-def within_distance(near: Neighbors, values: Tensor, max_sq_distance: Tensor) -> Tensor:
+def within_distance(near: Neighbors, values: Tensor, max_sq_distance: float) -> Tensor:
     """Return a mask of neighbors whose positions or colors ``(C, N)`` are within a distance."""
     total = values.new_zeros(())
     for column in map(near.gather, values.unbind()):

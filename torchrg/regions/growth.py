@@ -155,10 +155,9 @@ def label_regions(
         cut = cut_bridges(cloud, labels, fits.get(labels), config, chunk_size, grow_cores)
         labels = labels if cut is labels else rank_by_size(cut, fitted)
     if config.facet_tolerance is not None:
-        contacts, planes = KnnAdjacency(cloud.neighbors).contacts(labels), fits.get(labels)
-        tolerance, faceted = float(config.facet_tolerance), config.faceted is True
-        labels = merge_facets(labels, contacts, planes, tolerance=tolerance, faceted=faceted)
-        labels = rank_by_size(labels, min_points)
+        contacts = KnnAdjacency(cloud.neighbors).contacts(labels)
+        merged = merge_facets(labels, contacts, fits.get(labels), config)
+        labels = rank_by_size(merged, min_points)
     if config.cut_bridges:
         split = split_levels(cloud, labels, fits.get(labels), config)
         labels = labels if split is labels else rank_by_size(split, 1)
@@ -263,14 +262,12 @@ def rank_by_size(regions: Tensor, min_size: int) -> Tensor:
 
 
 def rank_by_count(labels: Tensor) -> Tensor:
-    """Return new region numbers by descending point count, ties in the old order.
+    """Return new region numbers ``(M,)`` by descending point count, ties in the old order.
 
-    ``labels`` ``(N,)`` are per point, -1 if unlabeled. The last of the numbers ``(M + 1,)`` belongs
-    to -1, so that labels can index them.
+    ``labels`` ``(N,)`` are per point, -1 if unlabeled.
     """
     counts = torch.bincount(labels + 1, minlength=1)[1:]
-    numbers = counts.argsort(descending=True, stable=True).argsort()
-    return torch.cat([numbers, numbers.new_tensor([UNLABELED])])
+    return counts.argsort(descending=True, stable=True).argsort()
 
 
 def grow(cloud: GrowingInput, config: GrowingConfig, chunk_size: int) -> Tensor:
@@ -320,21 +317,20 @@ def grow_fifo(
 
     Returns the root of each point's region.
     """
-    lists, free, is_seed_itself = neighbors.numpy(), valid.numpy().copy(), is_seed.numpy()
+    lists, free = neighbors.numpy(), valid.numpy().copy()
     roots = np.full(len(free), UNLABELED, dtype=np.int32)
+    width = lists.shape[1]
+    joined = _unpack(joins, width)
+    promotes = is_seed.numpy()[lists] if makes_seed is None else _unpack(makes_seed, width)
 
     def claim(root: np.integer, seed: np.integer, *, promoted: bool) -> NDArray[np.integer]:
         """Assign unassigned neighbors of a seed to a region, and return the new seeds."""
-        near = lists[seed]
-        claims = _unpack(joins, seed, len(near)) & free[near]
-        by_edge = None if makes_seed is None else _unpack(makes_seed, seed, len(near))
+        claims = joined[seed] & free[lists[seed]]
         if promoted:
-            claims &= by_edge
-        targets = near[claims]
+            claims &= promotes[seed]
+        targets = lists[seed][claims]
         free[targets], roots[targets] = False, root
-        new: NDArray[np.integer] = targets[
-            is_seed_itself[targets] if by_edge is None else by_edge[claims]
-        ]
+        new: NDArray[np.integer] = targets[promotes[seed][claims]]
         return new
 
     for root in order.numpy():
@@ -349,7 +345,7 @@ def grow_fifo(
     return torch.from_numpy(roots)
 
 
-def _unpack(bits: Tensor, row: np.integer, count: int) -> NDArray[np.bool_]:
-    """Return the bits of a row, one for each of ``count`` neighbors."""
-    flags = np.unpackbits(bits.numpy()[row].view(np.uint8), count=count, bitorder="little")
+def _unpack(bits: Tensor, width: int) -> NDArray[np.bool_]:
+    """Return the bits of words ``(N, words)``, one for each of ``width`` neighbors."""
+    flags = np.unpackbits(bits.numpy().view(np.uint8), axis=1, count=width, bitorder="little")
     return flags.view(np.bool_)

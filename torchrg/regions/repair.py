@@ -88,10 +88,13 @@ def refine_regions(
         labels = remove_small(labels, int(config.min_size))
     if config.merge_coplanar:
         planes = fits.get(labels)
-        contacts = _pairs_to_merge(labels, adjacency, planes, cloud.neighbors)
-        labels = merge_coplanar(labels, contacts, planes, tolerance=config.merge_tolerance)
+        # At the end of a strip narrower than a neighborhood, such as the rim of a table top, the
+        # nearest points belong to the adjacent surfaces.
+        strips = labels.where(value_of_points(planes.strips, labels, False), UNLABELED)
+        found = adjacency.contacts(labels), find_region_pairs(strips, cloud.neighbors)
+        pairs, counts = map(torch.cat, zip(*found, strict=True))
+        labels = merge_coplanar(labels, (pairs, counts), planes, tolerance=config.merge_tolerance)
     if config.refine_borders:
-        faceted = config.faceted is True
         labels = remove_small(labels, 1)
         planes = fits.get(labels)
         # The plane of a bent region does not show where the region ends.
@@ -103,10 +106,9 @@ def refine_regions(
             # A gap narrower than a neighborhood may divide a faceted surface. With white noise,
             # growth crosses it on one plane: regions still apart, such as cushions side by side,
             # are surfaces of their own. Results of rooms are equal with 4 to 16 neighbors.
-            all_pairs = find_region_pairs(labels, cloud.neighbors) if faceted else None
-            contacts = all_pairs or adjacency.contacts(labels)
-            tolerance = float(config.facet_tolerance)
-            labels = merge_facets(labels, contacts, planes, tolerance=tolerance, faceted=faceted)
+            faceted = config.faceted is True
+            contacts = find_region_pairs(labels, cloud.neighbors) if faceted else None
+            labels = merge_facets(labels, contacts or adjacency.contacts(labels), planes, config)
     return labels
 
 
@@ -202,20 +204,6 @@ def _lowest(cost: Tensor, options: Tensor) -> tuple[Tensor, Tensor]:
     return ranked.amin(dim=0), min_cost
 
 
-def _pairs_to_merge(
-    labels: Tensor, adjacency: KnnAdjacency, planes: RegionPlanes, neighbors: Neighbors
-) -> tuple[Tensor, Tensor]:
-    """Return adjacent pairs of regions, possibly twice; between strips all K neighbors count.
-
-    At the end of a strip narrower than a neighborhood, such as the rim of a table top, the nearest
-    points belong to the adjacent surfaces.
-    """
-    strips = value_of_points(planes.strips, labels, False)
-    pairs, counts = adjacency.contacts(labels)
-    others = find_region_pairs(torch.where(strips, labels, UNLABELED), neighbors)
-    return torch.cat([pairs, others[0]]), torch.cat([counts, others[1]])
-
-
 def merge_coplanar(
     labels: Tensor, contacts: tuple[Tensor, Tensor], planes: RegionPlanes, *, tolerance: float
 ) -> Tensor:
@@ -237,28 +225,24 @@ def merge_coplanar(
 
 
 def merge_facets(
-    labels: Tensor,
-    contacts: tuple[Tensor, Tensor],
-    planes: RegionPlanes,
-    *,
-    tolerance: float,
-    faceted: bool = True,
+    labels: Tensor, contacts: tuple[Tensor, Tensor], planes: RegionPlanes, config: GrowingConfig
 ) -> Tensor:
     """Greedily merge adjacent regions within a fixed distance of one plane.
 
     A reconstructed mesh represents a flat surface by facets. Each facet is exactly planar, so its
     thickness does not show how far it may be from the surface. Two regions are merged, smallest
-    distance first, if the RMS distance of each to their joint plane is at most ``tolerance`` (in
-    coordinate units). The joint plane must be tilted by at most 25 degrees against both, since a
-    strip narrower than the tolerance is close to any adjacent plane. If surfaces are ``faceted``,
-    the tilt alone must not move the points of either by more than two thirds of the tolerance, so
-    the facets of a bend are merged only if they are nearly coplanar. Nor may the mean of either
-    move by more than the noise of nearby points explains. For ``contacts`` and labels see
-    :func:`merge_coplanar`.
+    distance first, if the RMS distance of each to their joint plane is at most the
+    ``facet_tolerance`` (in coordinate units). The joint plane must be tilted by at most 25 degrees
+    against both, since a strip narrower than the tolerance is close to any adjacent plane. If
+    surfaces are ``faceted``, the tilt alone must not move the points of either by more than two
+    thirds of the tolerance, so the facets of a bend are merged only if they are nearly coplanar.
+    Nor may the mean of either move by more than the noise of nearby points explains. For
+    ``contacts`` and labels see :func:`merge_coplanar`.
     """
-    moments, limit = _region_moments(planes), torch.full_like(planes.floor, tolerance)
-    moments, bounds = moments._replace(scale=limit, noise=0 * limit), (torch.inf, torch.inf)
-    if faceted:
+    tolerance, bounds = float(config.facet_tolerance or 0.0), (torch.inf, torch.inf)
+    limit = torch.full_like(planes.floor, tolerance)
+    moments = _region_moments(planes)._replace(scale=limit, noise=0 * limit)
+    if config.faceted is True:
         bounds = _MAX_FACET_TILT * tolerance, _MAX_FACET_STEP * float(planes.reach.median())
     return _merge(labels, contacts, moments, 1.0, bounds)
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchrg import scratch
-from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_chunks, nonzero_rows, split_rows
+from torchrg._parallel import ROWS_IN_CACHE, map_chunks, nonzero_rows, split_rows
 from torchrg.config import GrowingConfig
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.linalg.angles import deg_to_sq_chord, sq_chords
@@ -117,9 +117,8 @@ def cut_bridges(
     has_core = torch.zeros_like(on_plane)
     has_core[labels[rows]] = True
     others = others[has_core[labels[others]]]
-    turn = torch.cat(
-        [_sq_turns(cloud, labels, planes, chunk) for chunk in torch.split(others, ROWS_AT_ONCE)]
-    )
+    ours, theirs = cloud.normals[others].double(), planes.normal[labels[others]]
+    turn = sq_chords(ours.unbind(dim=1), theirs.unbind(dim=1))
     near = others[turn <= deg_to_sq_chord(config.max_angle_deg)]
     # Only points aligned with the plane show which cores it meets.
     aligned = others[turn <= deg_to_sq_chord(_CORE_FRACTION * config.max_angle_deg)]
@@ -163,12 +162,6 @@ def _find_mixed(
     is_partial = value_of_points((num_off >= min_size) & on_plane, labels, False)
     is_whole = value_of_points((num_off >= min_size) & ~on_plane, labels, False)
     return nonzero_rows(is_whole | (is_partial & off)), nonzero_rows(is_partial & ~off), on_plane
-
-
-def _sq_turns(cloud: GrowingInput, labels: Tensor, planes: RegionPlanes, rows: Tensor) -> Tensor:
-    """Return the squared chords between the normals of points and of their planes, ``(n,)``."""
-    ours, theirs = cloud.normals[rows].double(), planes.normal[labels[rows]]
-    return sq_chords(ours.unbind(dim=1), theirs.unbind(dim=1))
 
 
 def _join_curved(
@@ -216,15 +209,14 @@ def _core_cloud(
     """Return some points as a cloud with the core limits, and neighbors of the same region."""
     row_of = torch.full((len(labels),), -1, dtype=torch.int32, device=rows.device)
     row_of[rows] = torch.arange(len(rows), dtype=torch.int32, device=rows.device)
-    narrow, local = labels.to(torch.int32), row_of[rows]
-    shape = len(rows), cloud.neighbors.indices.shape[1]
+    narrow, shape = labels.to(torch.int32), (len(rows), cloud.neighbors.indices.shape[1])
     indices = scratch.new_empty(cloud.neighbors.indices, shape)
     counted = scratch.new_empty(cloud.valid, shape)
     for chunk in split_rows(len(rows), chunk_size):
-        near, itself = cloud.neighbors.select(rows[chunk]), local[chunk, None]
+        near = cloud.neighbors.select(rows[chunk])
         local_rows = near.gather(row_of)
         counted[chunk] = _in_region(near, narrow) & (local_rows >= 0)
-        indices[chunk] = torch.where(counted[chunk], local_rows, itself)
+        indices[chunk] = torch.where(counted[chunk], local_rows, local_rows[:, :1])
     cores = cloud.select(rows, Neighbors(indices, counted))
     smooth = _are_smooth(cores, labels[rows], _SMOOTH_FRACTION * config.max_angle_deg, chunk_size)
     return cores._replace(
