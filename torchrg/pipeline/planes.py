@@ -30,7 +30,6 @@ from torchrg.normals.orient import Orientation, choose_side, find_directions, tu
 from torchrg.regions import grow_regions, summarize_planes
 from torchrg.regions.classes import find_kinds
 from torchrg.regions.growth import needs_sampling, rank_by_count
-from torchrg.regions.repair import remap_labels
 from torchrg.regions.selection import keep_planes, selected_rows
 from torchrg.structures import UNLABELED, AnyCloud, Cloud, Neighbors, Planes, Segmentation
 from torchrg.structures.planes import Deferred
@@ -209,7 +208,7 @@ def _segment(
     )
     point_labels = expand_to_points(labels, parts.inverse, fill=UNLABELED)
     numbers = rank_by_count(point_labels)
-    labels, point_labels = (remap_labels(each, numbers) for each in (labels, point_labels))
+    labels, point_labels = (scratch.store(numbers[each]) for each in (labels, point_labels))
 
     begin("planes")
     growing = config.growing

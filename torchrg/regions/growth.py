@@ -163,7 +163,8 @@ def label_regions(
         labels = labels if split is labels else rank_by_size(split, 1)
     if config.absorb or config.merge_coplanar or config.max_plane_residual is not None:
         labels = rank_by_size(refine_regions(cloud, labels, config, fits), int(config.min_size))
-    return keep_regions(labels, ~find_solid_regions(cloud, labels))
+    solid = find_solid_regions(cloud, labels)
+    return keep_regions(labels, ~solid) if bool(solid.any()) else labels
 
 
 def checked_cloud(
@@ -262,12 +263,14 @@ def rank_by_size(regions: Tensor, min_size: int) -> Tensor:
 
 
 def rank_by_count(labels: Tensor) -> Tensor:
-    """Return new region numbers ``(M,)`` by descending point count, ties in the old order.
+    """Return new region numbers by descending point count, ties in the old order.
 
-    ``labels`` ``(N,)`` are per point, -1 if unlabeled.
+    ``labels`` ``(N,)`` are per point, -1 if unlabeled. The last of the numbers ``(M + 1,)`` belongs
+    to -1, so that labels can index them.
     """
     counts = torch.bincount(labels + 1, minlength=1)[1:]
-    return counts.argsort(descending=True, stable=True).argsort()
+    numbers = counts.argsort(descending=True, stable=True).argsort()
+    return torch.cat([numbers, numbers.new_tensor([UNLABELED])])
 
 
 def grow(cloud: GrowingInput, config: GrowingConfig, chunk_size: int) -> Tensor:

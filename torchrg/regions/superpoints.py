@@ -23,7 +23,7 @@ from torchrg.regions.adjacency import NUM_CONTACTS, KnnAdjacency
 from torchrg.regions.edges import neighborhood_radii
 from torchrg.regions.fit import fit_planes, mean_normals
 from torchrg.regions.growth import rank_by_count
-from torchrg.regions.repair import remap_labels, value_of_points
+from torchrg.regions.repair import value_of_points
 from torchrg.regions.splits import connected_points
 from torchrg.robust.lanes import sum_products, sum_squares
 from torchrg.structures import UNLABELED, Neighbors, Sampling, Superpoints
@@ -140,7 +140,7 @@ def partition_points(
     levels = []
     for level in partitions:
         of_points = distinct.restore(level.to(points.device), fill=UNLABELED)
-        levels.append(remap_labels(of_points, rank_by_count(of_points)))
+        levels.append(rank_by_count(of_points)[of_points])
     return Superpoints(levels[0], majority_planes(levels[0], labels), tuple(levels[1:]))
 
 

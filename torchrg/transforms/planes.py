@@ -29,7 +29,6 @@ from torchrg.normals.orient import Orientation
 from torchrg.pipeline import segment_planes
 from torchrg.regions import align_axes, grow_regions, partition_points
 from torchrg.regions.growth import rank_by_count
-from torchrg.regions.repair import remap_labels
 from torchrg.structures import UNLABELED
 from torchrg.structures.colors import find_white
 from torchrg.transforms.rows import Sample, cloud_rows
@@ -213,7 +212,7 @@ class GrowRegions(CloudTransform):
             canonical=True,
         )
         plane = distinct.restore(grown, fill=UNLABELED)
-        return {"plane": remap_labels(plane, rank_by_count(plane))}
+        return {"plane": rank_by_count(plane)[plane]}
 
 
 class SegmentPlanes(OrientedTransform):
