@@ -7,56 +7,99 @@ constexpr int MAX_CANDIDATES = 4096;  // points of a cell and those around it
 constexpr int MAX_CHOSEN = 1024;      // of these, the sorted ones
 constexpr double SURELY = 1e-6;       // rounding of the cell of a point at a boundary
 
+#ifdef __AVX2__
+constexpr int SHORT_LANES = 16;
+#else
+constexpr int SHORT_LANES = 8;
+#endif
+typedef int16_t Shorts __attribute__((vector_size(2 * SHORT_LANES)));
+
 struct Candidates {
   alignas(32) double x[MAX_CANDIDATES], y[MAX_CANDIDATES], z[MAX_CANDIDATES],
       square[MAX_CANDIDATES];
-  int32_t row[MAX_CANDIDATES], chosen[MAX_CANDIDATES];
-  alignas(32) float key[MAX_CHOSEN];  // their squared distances, rounded
-  alignas(32) int32_t rank[MAX_CHOSEN];
-  int32_t sorted[MAX_CHOSEN];
+  alignas(32) float key[MAX_CANDIDATES + LANES];  // squared distances, rounded
+  int32_t row[MAX_CANDIDATES], sorted[MAX_CHOSEN];
+  alignas(32) float chosen_key[MAX_CHOSEN + SHORT_LANES];
+  alignas(32) int32_t chosen[MAX_CHOSEN + SHORT_LANES];
+  alignas(32) int16_t step[MAX_CHOSEN], rank[MAX_CHOSEN];  // keys in steps, and their ranks
 };
 
-// Counts the keys below each of some keys.
+#ifdef __AVX2__
+// Lanes in an order that moves flagged ones to the front.
+struct Orders {
+  alignas(32) int32_t lanes[1 << LANES][LANES];
+
+  constexpr Orders() : lanes() {
+    for (int bits = 0; bits < 1 << LANES; bits++)
+      for (int lane = 0, n = 0; lane < LANES; lane++)
+        if (bits >> lane & 1) lanes[bits][n++] = lane;
+  }
+};
+constexpr Orders ORDERS;
+#endif
+
+// Chooses candidates with keys below a limit, at most MAX_CHOSEN and some; returns their number.
+INLINE int choose(Candidates& all, int n, float limit) {
+  int count = 0;
+  for (int t = 0; t < n && count <= MAX_CHOSEN; t += LANES) {
+    const Lanes keys = load(all.key + t);
+    const Flags flags = keys < limit;
+#ifdef __AVX2__
+    const int bits = __builtin_ia32_movmskps256((Lanes)flags);
+    const Flags order = load(ORDERS.lanes[bits]), numbers = order + t;
+    store(all.chosen_key + count, (Lanes)__builtin_ia32_permvarsf256(keys, order));
+    __builtin_memcpy(all.chosen + count, &numbers, sizeof numbers);
+    count += __builtin_popcount(bits);
+#else
+    for (int lane = 0; lane < LANES; lane++) {
+      all.chosen_key[count] = keys[lane], all.chosen[count] = t + lane;
+      count -= flags[lane];
+    }
+#endif
+  }
+  return count;
+}
+
+// Counts the steps below each of some steps.
 template <int num_vectors>
-INLINE void rank_keys(Candidates& all, int first, int count) {
-  Lanes keys[num_vectors];
-  Flags ranks[num_vectors] = {};
-  for (int v = 0; v < num_vectors; v++) keys[v] = load(all.key + first + v * LANES);
+INLINE void rank_steps(Candidates& all, int first, int count) {
+  Shorts steps[num_vectors], ranks[num_vectors] = {};
+  __builtin_memcpy(steps, all.step + first, sizeof steps);
   for (int j = 0; j < count; j++) {
-    const Lanes other = Lanes{} + all.key[j];
-    for (int v = 0; v < num_vectors; v++) ranks[v] -= other < keys[v];
+    const Shorts other = Shorts{} + all.step[j];
+    for (int v = 0; v < num_vectors; v++) ranks[v] -= other < steps[v];
   }
   __builtin_memcpy(all.rank + first, ranks, sizeof ranks);
 }
 
-// Sorts selected candidates by distance, then row; returns the k-th distance.
-INLINE double sort(Candidates& all, int count, int k, int32_t* sorted) {
-  const int width = padded(count);
-  for (int i = 0; i < width; i++) all.key[i] = float(all.square[all.chosen[i < count ? i : 0]]);
+// Sorts chosen candidates by distance, then row.
+INLINE void sort(Candidates& all, int count, float limit) {
+  const float scale = 65535 / limit;
+  const int width = (count + SHORT_LANES - 1) / SHORT_LANES * SHORT_LANES;
+  for (int i = count; i < width; i++) all.chosen_key[i] = 0;
+  for (int i = 0; i < width; i++) all.step[i] = int16_t(int(all.chosen_key[i] * scale) - 32768);
   int ranked = 0;
-  for (; ranked + 3 * LANES <= width; ranked += 3 * LANES) rank_keys<3>(all, ranked, count);
-  for (; ranked < width; ranked += LANES) rank_keys<1>(all, ranked, count);
-  int64_t sum = 0;
+  for (; ranked + 3 * SHORT_LANES <= width; ranked += 3 * SHORT_LANES)
+    rank_steps<3>(all, ranked, count);
+  for (; ranked < width; ranked += SHORT_LANES) rank_steps<1>(all, ranked, count);
+  int sum = 0;
   for (int i = 0; i < count; i++) sum += all.rank[i], all.sorted[all.rank[i]] = all.chosen[i];
-  if (sum != int64_t(count) * (count - 1) / 2) {
-    // Equal keys share a rank: place them one after another, and sort each run.
-    for (int i = 0; i < count; i++) all.sorted[i] = -1;
-    for (int i = 0; i < count; i++) {
-      int at = all.rank[i];
-      while (all.sorted[at] >= 0) at++;
-      const int candidate = all.chosen[i];
-      const double distance = square_root(all.square[candidate]);
-      for (; at > all.rank[i]; at--) {
-        const int before = all.sorted[at - 1];
-        const double other = square_root(all.square[before]);
-        if (other < distance || (other == distance && all.row[before] < all.row[candidate])) break;
-        all.sorted[at] = before;
-      }
-      all.sorted[at] = candidate;
+  if (sum == count * (count - 1) / 2) return;
+  // Equal steps share a rank: place them one after another, and sort each run.
+  for (int i = 0; i < count; i++) all.sorted[i] = -1;
+  for (int i = 0; i < count; i++) {
+    int at = all.rank[i];
+    while (all.sorted[at] >= 0) at++;
+    const int candidate = all.chosen[i];
+    const double distance = square_root(all.square[candidate]);
+    for (; at > all.rank[i]; at--) {
+      const int before = all.sorted[at - 1];
+      const double other = square_root(all.square[before]);
+      if (other < distance || (other == distance && all.row[before] < all.row[candidate])) break;
+      all.sorted[at] = before;
     }
+    all.sorted[at] = candidate;
   }
-  for (int j = 0; j < k; j++) sorted[j] = all.row[all.sorted[j]];
-  return square_root(all.square[all.sorted[k - 1]]);
 }
 
 // Inserts two zero bits between the bits of a number below 2^21.
@@ -155,15 +198,15 @@ KERNEL fill_cells(int64_t num_points, int64_t num_cells, const double* points, i
 // Writes the k nearest neighbors of the selected points in cells `from` to `to` to their rows of
 // `found`, renumbered by `order` if given; `certain` marks exact results.
 KERNEL search_cells(int64_t num_points, int64_t num_cells, int64_t num_lists, int64_t k,
-                    const double* sorted, Ints rows, Ints starts, Flagged selected, Longs order, int32_t* found,
-                    bool* certain, int64_t from, int64_t to, int64_t width, int64_t height,
+                    const double* sorted, Ints rows, Ints starts, Flagged selected, Longs order,
+                    int32_t* found, bool* certain, int64_t from, int64_t to, int64_t width, int64_t height,
                     int64_t first_row, double x, double y, double z, double size) {
   if (k < 1 || k > MAX_WIDTH || from < 0 || to > num_cells - 1) return TOO_WIDE;
   if (width < 1 || height < 1 || width > num_cells || height > num_cells) return TOO_WIDE;
   if (num_points > INT32_MAX || num_cells > INT32_MAX) return TOO_WIDE;
   Candidates all;
   const int64_t step = width * height;
-  double guess = 0;
+  float guess = 0;
   for (int64_t c = from; c < to; c++) {
     if (starts[c] == starts[c + 1]) continue;
     int64_t number = 0, first[9], length[9];
@@ -183,6 +226,7 @@ KERNEL search_cells(int64_t num_points, int64_t num_cells, int64_t num_lists, in
         all.row[n] = rows[t];
       }
     }
+    for (int t = n; t < padded(n); t++) all.key[t] = INFINITE;
     const double u = x + (double(c / step) - 0.5) * size, w = z + (double(c % height) - 0.5) * size,
                  v = y + (double(c / height % width) - 0.5) * size;
     for (int64_t position = starts[c]; position < starts[c + 1]; position++) {
@@ -193,22 +237,19 @@ KERNEL search_cells(int64_t num_points, int64_t num_cells, int64_t num_lists, in
       const double *query = sorted + 3 * position, px = query[0], py = query[1], pz = query[2];
       for (int t = 0; t < n; t++) {
         const double a = all.x[t] - px, b = all.y[t] - py, d = all.z[t] - pz;
-        all.square[t] = a * a + b * b + d * d;
+        all.square[t] = a * a + b * b + d * d, all.key[t] = float(all.square[t]);
       }
       const double off = larger(larger(size_of(px - u), size_of(py - v)), size_of(pz - w));
-      const double border = (1.5 * size - off) * (1 - SURELY), max_square = border * border;
-      double within = guess > 0 && guess < max_square ? guess : max_square;
+      const double border = (1.5 * size - off) * (1 - SURELY);
+      const float max_square = float(border * border);
+      float within = guess > 0 && guess < max_square ? guess : max_square;
       int count = 0;
       for (int turn = 0; turn < 8; turn++) {
-        count = 0;
-        for (int t = 0; t < n; t++) {
-          all.chosen[count] = t;
-          count += all.square[t] < within;
-        }
+        count = choose(all, n, within);
         if (count > MAX_CHOSEN)
-          within *= 0.7;
+          within *= 0.7f;
         else if (count < k && within < max_square)
-          within = smaller(within * 1.6, max_square);
+          within = smaller(within * 1.6f, max_square);
         else
           break;
       }
@@ -216,13 +257,16 @@ KERNEL search_cells(int64_t num_points, int64_t num_cells, int64_t num_lists, in
       const int64_t to_row = order ? order[row] : row;
       if (to_row < 0 || to_row >= num_lists) return NO_SUCH_ROW;
       int32_t* list = found + k * to_row;
-      const double farthest = sort(all, count, int(k), list);
+      sort(all, count, within);
+      const double farthest = square_root(all.square[all.sorted[k - 1]]);
       // Whether a point outside could tie with the last neighbor by rounding.
-      if (!(farthest * (1 + SURELY) < square_root(within))) continue;
-      for (int j = 0; j < k; j++)
-        list[j] = int32_t((order ? order[list[j]] : int64_t(list[j])) + first_row);
+      if (!(farthest * (1 + SURELY) < square_root(double(within)))) continue;
+      for (int j = 0; j < k; j++) {
+        const int32_t near = all.row[all.sorted[j]];
+        list[j] = int32_t((order ? order[near] : int64_t(near)) + first_row);
+      }
       certain[row] = true;
-      guess = farthest * farthest * 1.35;
+      guess = float(farthest * farthest * 1.2);
     }
   }
   return DONE;
