@@ -86,19 +86,18 @@ INLINE void sort(Candidates& all, int count, float limit) {
   for (int i = 0; i < count; i++) sum += all.rank[i], all.sorted[all.rank[i]] = all.chosen[i];
   if (sum == count * (count - 1) / 2) return;
   // Equal steps share a rank: place them one after another, and sort each run.
+  const auto is_before = [&](int a, int b) {
+    if (all.key[a] != all.key[b]) return all.key[a] < all.key[b];
+    const double here = square_root(all.square[a]), there = square_root(all.square[b]);
+    return here < there || (here == there && all.row[a] < all.row[b]);
+  };
   for (int i = 0; i < count; i++) all.sorted[i] = -1;
   for (int i = 0; i < count; i++) {
     int at = all.rank[i];
     while (all.sorted[at] >= 0) at++;
-    const int candidate = all.chosen[i];
-    const double distance = square_root(all.square[candidate]);
-    for (; at > all.rank[i]; at--) {
-      const int before = all.sorted[at - 1];
-      const double other = square_root(all.square[before]);
-      if (other < distance || (other == distance && all.row[before] < all.row[candidate])) break;
-      all.sorted[at] = before;
-    }
-    all.sorted[at] = candidate;
+    for (; at > all.rank[i] && is_before(all.chosen[i], all.sorted[at - 1]); at--)
+      all.sorted[at] = all.sorted[at - 1];
+    all.sorted[at] = all.chosen[i];
   }
 }
 
@@ -208,7 +207,13 @@ KERNEL search_cells(int64_t num_points, int64_t num_cells, int64_t num_lists, in
   const int64_t step = width * height;
   float guess = 0;
   for (int64_t c = from; c < to; c++) {
-    if (starts[c] == starts[c + 1]) continue;
+    bool is_empty = true;
+    for (int64_t position = starts[c]; position < starts[c + 1]; position++) {
+      if (position < 0 || position >= num_points || !is_row(rows[position], num_points))
+        return NO_SUCH_ROW;
+      is_empty &= !selected[rows[position]];
+    }
+    if (is_empty) continue;
     int64_t number = 0, first[9], length[9];
     for (int g = 0; g < 9; g++) {
       const int64_t middle = c + (g / 3 - 1) * step + (g % 3 - 1) * height;
@@ -230,9 +235,7 @@ KERNEL search_cells(int64_t num_points, int64_t num_cells, int64_t num_lists, in
     const double u = x + (double(c / step) - 0.5) * size, w = z + (double(c % height) - 0.5) * size,
                  v = y + (double(c / height % width) - 0.5) * size;
     for (int64_t position = starts[c]; position < starts[c + 1]; position++) {
-      if (position < 0 || position >= num_points) return NO_SUCH_ROW;
       const int32_t row = rows[position];
-      if (!is_row(row, num_points)) return NO_SUCH_ROW;
       if (!selected[row]) continue;
       const double *query = sorted + 3 * position, px = query[0], py = query[1], pz = query[2];
       for (int t = 0; t < n; t++) {
