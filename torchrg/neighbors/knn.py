@@ -33,9 +33,8 @@ from torchrg.structures.points import Rows, bounding_box
 _SAMPLE_SIZE = 200
 """Number of sampled points that estimate the distance of the k-th neighbor."""
 _WINDOW = 8
-"""Consecutive points in canonical order, as a multiple of k, among which the k nearest of a sampled
-point are at a distance that is 1.05 times too large in the median, and 1.5 times in the worst tenth.
-"""
+"""Consecutive points in canonical order, as a multiple of k, among which the k-th nearest of a
+sampled point is 1.05 times too far in the median, and 1.5 times in the worst tenth."""
 SomeNeighbors = Callable[[NDArray[np.integer]], NDArray[np.integer]]
 """Function from rows ``(n,)`` to their neighbors ``(n, k)``, each first its own."""
 _MIN_FOR_CELLS = 2000

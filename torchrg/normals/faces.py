@@ -15,6 +15,7 @@ from torch import Tensor
 from torchrg import kernels, scratch
 from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_tasks, nonzero_rows, split_rows
 from torchrg.linalg.moments import dot
+from torchrg.neighbors.order import mark_distinct, sort_integers
 
 _RANKS = (2, 4, 6, 9, 12, 15)
 """Neighbor ranks over which faces spread. Noise tilts the links to nearer ones."""
@@ -59,24 +60,13 @@ def find_faces(
     int32, and the sign that makes its normal consistent within the face, ``(N,)`` each. Some face
     IDs are unused.
     """
-    faces = torch.full((len(points),), -1, dtype=torch.int32)
-    signs, rows = normals.new_ones(len(points)), scratch.store(nonzero_rows(labels >= 0))
-    label, axes = scratch.store(labels.index_select(0, rows).long()), axes.to(points)
-    side, is_thin = _split_plates(points, rows, label, axes, max_thickness)
-    for part in split_rows(len(rows), ROWS_AT_ONCE):
-        near_plane, plane = rows[part], label[part]
-        cosine = dot(normals.index_select(0, near_plane), axes.index_select(0, plane))
-        kept = nonzero_rows(is_thin.index_select(0, plane) & (cosine.abs() > _MIN_COSINE))
-        chosen, face = near_plane.index_select(0, kept), 2 * plane + side[part]
-        faces.index_copy_(0, chosen, face.index_select(0, kept).int())
-        signs.index_copy_(0, chosen, cosine.index_select(0, kept).sign())
-    del label, side, rows
+    faces, signs = _find_planes(points, normals, labels, axes.to(points), max_thickness)
     rows = nonzero_rows(faces >= 0)
     joined, signs = _join_patches(points, normals, near, faces, signs, _MIN_AGREEMENT)
     has_plane = torch.zeros(int(joined.max()) + 1, dtype=torch.bool)
-    has_plane[joined[rows]] = True
-    rows = nonzero_rows(~has_plane[joined])
-    indices, patch = torch.unique(joined[rows], return_inverse=True)
+    has_plane[joined.index_select(0, rows)] = True
+    rows = nonzero_rows(~has_plane.index_select(0, joined))
+    indices, patch = torch.unique(joined.index_select(0, rows), return_inverse=True)
     sums = normals.new_zeros(len(indices), 3)
     for part in split_rows(len(rows), ROWS_AT_ONCE):
         sums.index_add_(0, patch[part], normals[rows[part]] * signs[rows[part], None])
@@ -84,6 +74,27 @@ def find_faces(
     side, _ = _split_plates(points, rows, patch, axes, max_thickness)
     joined[rows] += len(has_plane) * side
     return joined, signs
+
+
+def _find_planes(
+    points: Tensor, normals: Tensor, labels: Tensor, axes: Tensor, max_thickness: float
+) -> tuple[Tensor, Tensor]:
+    """Return the faces of thin planes, -1 at other points, and signs; see :func:`find_faces`."""
+    faces = torch.full((len(points),), -1, dtype=torch.int32)
+    signs, rows = normals.new_ones(len(points)), scratch.store(nonzero_rows(labels >= 0))
+    label = scratch.store(labels.index_select(0, rows).long())
+    side, is_thin = _split_plates(points, rows, label, axes, max_thickness)
+
+    def mark(part: slice) -> None:
+        near_plane, plane = rows[part], label[part]
+        cosine = dot(normals.index_select(0, near_plane), axes.index_select(0, plane))
+        kept = nonzero_rows(is_thin.index_select(0, plane) & (cosine.abs() > _MIN_COSINE))
+        chosen, face = near_plane.index_select(0, kept), 2 * plane + side[part]
+        faces.index_copy_(0, chosen, face.index_select(0, kept).int())
+        signs.index_copy_(0, chosen, cosine.index_select(0, kept).sign())
+
+    map_tasks(mark, split_rows(len(rows), ROWS_AT_ONCE), rows.device)
+    return faces, signs
 
 
 def gather_lists(near: Tensor, rows: Tensor, ranks: list[int]) -> Tensor:
@@ -159,15 +170,16 @@ def _join_patches(
     def compare(chunk: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         starts, ends, cosine, bend = _find_links(points, normals, near, chunk, ranks, faces)
         trust = (1 - bend / 2).clamp(min=0) ** _TRUST_POWER
-        agreement = trust * cosine.sign() * signs[starts] * signs[ends]
-        return faces[starts], faces[ends], agreement
+        here, there = (signs.index_select(0, rows) for rows in (starts, ends))
+        agreement = trust * cosine.sign() * here * there
+        return faces.index_select(0, starts), faces.index_select(0, ends), agreement
 
     links = map_tasks(compare, torch.split(rows, ROWS_AT_ONCE), rows.device)
     low, high, agreement = (torch.cat(parts) for parts in zip(*links, strict=True))
     del links, rows
     sizes = torch.bincount(faces)
     joined, flips = _join_faces(low, high, agreement, sizes, strong)
-    return joined[faces], signs * flips[faces].to(signs)
+    return joined.index_select(0, faces), signs * flips.index_select(0, faces).to(signs)
 
 
 def _grow_patches(
@@ -239,33 +251,37 @@ def _join_faces(
     one is flipped. Faces of many points join if it is ``strong`` for their ``sizes`` ``(M,)``.
     Returns the new index of each face, int32, and its sign, ``(M,)``.
     """
-    from scipy.sparse import coo_array
-
-    indices, signs = torch.arange(len(sizes), dtype=torch.int32), torch.ones(len(sizes))
+    count = len(sizes)
+    indices, signs = torch.arange(count, dtype=torch.int32), torch.ones(count)
     while True:
-        is_between = low != high
-        ends = torch.stack([torch.minimum(low, high), torch.maximum(low, high)])[:, is_between]
-        values = agreement[is_between].double().numpy(), tuple(ends.numpy())
-        half = coo_array(values, shape=(len(sizes), len(sizes))).tocsr()
-        both = (half + half.T).tocsr()
-        both.sort_indices()
-        strength, owner = np.abs(both.data), np.repeat(np.arange(len(sizes)), np.diff(both.indptr))
-        limit = torch.where(sizes < _MIN_FACE_POINTS, 0.0, strong * sizes).double().numpy()
-        np.maximum.at(limit, owner, strength)
+        keys = torch.minimum(low, high).long() * count + torch.maximum(low, high)
+        order, pairs = sort_integers(keys)
+        starts = mark_distinct(pairs)
+        values = agreement.index_select(0, order).double()
+        # Without links the counts are integers.
+        totals = torch.bincount(starts.cumsum(0) - 1, values).double()
+        pairs = pairs.index_select(0, nonzero_rows(starts))
+        low, high = pairs // count, pairs % count
+        agreement = torch.where(low == high, 0.0, totals)
+        owner, other, strength = torch.cat([low, high]), torch.cat([high, low]), agreement.abs()
+        strength = strength.repeat(2)
+        limit = torch.where(sizes < _MIN_FACE_POINTS, 0.0, strong * sizes).double()
+        limit.scatter_reduce_(0, owner, strength, "amax")
+        chosen = nonzero_rows((strength == limit[owner]) & (strength > 0))
         # Ties go to the first, so that only two faces can choose each other in a cycle.
-        chosen = np.flatnonzero((strength == limit[owner]) & (strength > 0))
-        chosen = chosen[np.unique(owner[chosen], return_index=True)[1]]
-        components = _Components(len(sizes))
-        pairs = torch.from_numpy(np.stack([owner[chosen], both.indices[chosen]]).astype(np.int32))
-        components.link(pairs[0], pairs[1], torch.from_numpy(both.data[chosen] < 0))
+        choices = 2 * other + (agreement < 0).repeat(2)
+        best = torch.full((count,), 2 * count)
+        best.scatter_reduce_(0, owner[chosen], choices[chosen], "amin")
+        rows = nonzero_rows(best < 2 * count)
+        components = _Components(count)
+        components.link(rows.int(), (best[rows] // 2).int(), best[rows] % 2 == 1)
         joined, flips = components.find()
-        if int(joined.max()) + 1 == len(sizes):
+        count = int(joined.max()) + 1
+        if count == len(sizes):
             return indices, signs
         indices, signs = joined[indices], signs * flips[indices]
         sizes = torch.bincount(joined, sizes).long()
-        half = half.tocoo()
-        low, high = (torch.from_numpy(end) for end in half.coords)
-        agreement = torch.from_numpy(half.data) * flips[low] * flips[high]
+        agreement = agreement * flips[low] * flips[high]
         low, high = joined[low], joined[high]
 
 

@@ -14,6 +14,7 @@ from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_tasks
 from torchrg.linalg.moments import dot, kth_smallest
 from torchrg.neighbors.order import sort_integers
 from torchrg.normals.faces import gather_lists
+from torchrg.structures.points import bounding_box
 
 _SPACINGS_PER_CELL = 1.5
 _SPACING_QUANTILE = 0.9
@@ -52,7 +53,8 @@ def vote_free_side(
     ``rows`` ``(n,)`` vote. Votes ``(n,)`` are positive if the normal points to the freer side.
     """
     at, cell = _mark_cells(points, rows, width)
-    normal = normals[rows]
+    to_low, normal = at[:, cell], normals[rows]
+    to_high = at.max(axis=1, keepdims=True) - to_low
     obstacles = map_tasks(
         lambda chunk: _find_obstacles(points, normals, near, chunk, width),
         torch.split(rows, ROWS_IN_CACHE),
@@ -64,7 +66,8 @@ def vote_free_side(
         stride = math.sqrt(sum(step * step for step in steps))
         cosine = dot(normal, normal.new_tensor(steps)) / stride
         ahead, behind = (
-            torch.from_numpy(score).to(normal) for score in _free_paths(at, cell, steps, stride)
+            torch.from_numpy(score).to(normal)
+            for score in _free_paths(at, cell, to_low, to_high, steps, stride)
         )
         is_front = cosine > 0
         ahead = torch.minimum(ahead, torch.where(is_front, front, back))
@@ -78,7 +81,7 @@ def _mark_cells(
     points: Tensor, rows: Tensor, width: float
 ) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
     """Return the occupied cells ``(3, C)`` of a grid, and the index of the cell of some points."""
-    low = points.amin(dim=0)
+    low = torch.from_numpy(bounding_box(points.numpy())[0]).to(points)
 
     def encode(positions: Tensor) -> Tensor:
         x, y, z = ((positions - low) / width).long().unbind(dim=1)
@@ -98,12 +101,14 @@ def cell_width(points: Tensor, near: Tensor) -> float:
     if rank == 0:
         return 1.0
     rows = torch.arange(0, len(points), max(len(points) // ROWS_AT_ONCE, 1))
-    offsets = points[gather_lists(near, rows, [rank])[:, 0]] - points[rows]
+    ends = gather_lists(near, rows, [rank])[:, 0]
+    offsets = points.index_select(0, ends) - points[rows]
     # A disk of that radius holds ``rank`` points, one per squared spacing.
     spacing = dot(offsets, offsets).sqrt() * math.sqrt(math.pi / rank)
     at = math.ceil(_SPACING_QUANTILE * len(rows)) - 1
     width = _SPACINGS_PER_CELL * float(kth_smallest(spacing, at))
-    extent = float((points.amax(dim=0) - points.amin(dim=0)).max())
+    low, high = (torch.from_numpy(end).to(points) for end in bounding_box(points.numpy()))
+    extent = float((high - low).max())
     return max(width, 2 * extent / _MAX_CELLS) or 1.0
 
 
@@ -111,11 +116,14 @@ def _find_obstacles(
     points: Tensor, normals: Tensor, near: Tensor, rows: Tensor, width: float
 ) -> list[Tensor]:
     """Return the weights of paths to the nearest neighboring faces ahead and behind."""
-    ranks = list(range(min(_NUM_OBSTACLES, near.shape[1])))
-    ends, normal = gather_lists(near, rows, ranks), normals[rows, None]
-    offsets = points[ends] - points[rows, None]
+    ranks, normal = list(range(min(_NUM_OBSTACLES, near.shape[1]))), normals[rows, None]
+    ends = gather_lists(near, rows, ranks)
+    positions, others = (
+        values.index_select(0, ends.view(-1)).view(*ends.shape, 3) for values in (points, normals)
+    )
+    offsets = positions - points[rows, None]
     height = dot(offsets, normal)
-    is_face = dot(normals[ends], normal).abs() > _MIN_PARALLEL_COSINE
+    is_face = dot(others, normal).abs() > _MIN_PARALLEL_COSINE
     is_face &= height * height > _MIN_ELEVATION_SINE * _MIN_ELEVATION_SINE * dot(offsets, offsets)
     nearest = (
         torch.where(is_face & (above > 0), above, torch.inf).amin(dim=1)
@@ -125,19 +133,25 @@ def _find_obstacles(
 
 
 def _free_paths(
-    at: NDArray[np.int32], cell: NDArray[np.int64], steps: tuple[int, ...], stride: float
+    at: NDArray[np.int32],
+    cell: NDArray[np.int64],
+    to_low: NDArray[np.int32],
+    to_high: NDArray[np.int32],
+    steps: tuple[int, ...],
+    stride: float,
 ) -> list[NDArray[np.float32]]:
     """Return the weights of the free paths from some cells in a direction and its opposite.
 
-    Of the occupied cells ``at`` ``(3, C)``, paths start at ``cell`` ``(n,)``. Each is ``(n,)``.
+    Of the occupied cells ``at`` ``(3, C)``, paths start at ``cell`` ``(n,)``, which are ``to_low``
+    and ``to_high`` ``(3, n)`` cells from the ends of the grid. Each is ``(n,)``.
     """
-    sides, here, scores = at.max(axis=1) + 1, at[:, cell], []
+    scores = []
     for gaps, sign in zip(_free_gaps(at, steps), (1, -1), strict=True):
         free = gaps[cell]
         to_ends = [
-            sides[axis] - 1 - here[axis] if steps[axis] * sign > 0 else here[axis]
-            for axis in range(3)
-            if steps[axis]
+            (to_high if step * sign > 0 else to_low)[axis]
+            for axis, step in enumerate(steps)
+            if step
         ]
         path = stride * np.where(free < 0, np.minimum.reduce(to_ends), free).astype(np.float32)
         weight = np.where(free < 0, np.float32(_OPEN_WEIGHT), np.float32(1))
