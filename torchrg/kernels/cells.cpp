@@ -19,8 +19,8 @@ struct Candidates {
       square[MAX_CANDIDATES];
   alignas(32) float key[MAX_CANDIDATES + LANES];  // squared distances, rounded
   int32_t row[MAX_CANDIDATES], sorted[MAX_CHOSEN];
-  alignas(32) float chosen_key[MAX_CHOSEN + SHORT_LANES];
-  alignas(32) int32_t chosen[MAX_CHOSEN + SHORT_LANES];
+  alignas(32) float chosen_key[MAX_CHOSEN + LANES];
+  alignas(32) int32_t chosen[MAX_CHOSEN + LANES];
   alignas(32) int16_t step[MAX_CHOSEN], rank[MAX_CHOSEN];  // keys in steps, and their ranks
 };
 
@@ -60,28 +60,23 @@ INLINE int choose(Candidates& all, int n, float limit) {
   return count;
 }
 
-// Counts the steps below each of some steps.
-template <int num_vectors>
-INLINE void rank_steps(Candidates& all, int first, int count) {
-  Shorts steps[num_vectors], ranks[num_vectors] = {};
-  __builtin_memcpy(steps, all.step + first, sizeof steps);
-  for (int j = 0; j < count; j++) {
-    const Shorts other = Shorts{} + all.step[j];
-    for (int v = 0; v < num_vectors; v++) ranks[v] -= other < steps[v];
-  }
-  __builtin_memcpy(all.rank + first, ranks, sizeof ranks);
-}
-
 // Sorts chosen candidates by distance, then row.
 INLINE void sort(Candidates& all, int count, float limit) {
+  constexpr int BLOCK = 2 * SHORT_LANES;
   const float scale = 65535 / limit;
-  const int width = (count + SHORT_LANES - 1) / SHORT_LANES * SHORT_LANES;
+  const int width = (count + BLOCK - 1) / BLOCK * BLOCK;
   for (int i = count; i < width; i++) all.chosen_key[i] = 0;
   for (int i = 0; i < width; i++) all.step[i] = int16_t(int(all.chosen_key[i] * scale) - 32768);
-  int ranked = 0;
-  for (; ranked + 3 * SHORT_LANES <= width; ranked += 3 * SHORT_LANES)
-    rank_steps<3>(all, ranked, count);
-  for (; ranked < width; ranked += SHORT_LANES) rank_steps<1>(all, ranked, count);
+  // The rank of a step is the number of steps below it.
+  for (int i = 0; i < width; i += BLOCK) {
+    Shorts steps[2], ranks[2] = {};
+    __builtin_memcpy(steps, all.step + i, sizeof steps);
+    for (int j = 0; j < count; j++) {
+      const Shorts other = Shorts{} + all.step[j];
+      ranks[0] -= other < steps[0], ranks[1] -= other < steps[1];
+    }
+    __builtin_memcpy(all.rank + i, ranks, sizeof ranks);
+  }
   int sum = 0;
   for (int i = 0; i < count; i++) sum += all.rank[i], all.sorted[all.rank[i]] = all.chosen[i];
   if (sum == count * (count - 1) / 2) return;
@@ -110,9 +105,12 @@ INLINE uint64_t spread(uint64_t bits) {
   return (bits | bits << 2) & 0x1249249249249249;
 }
 
-template <class T>
-INLINE int64_t fill_codes(int64_t num_points, const T* points, const double (&low)[3],
-                          double extent, int64_t* codes) {
+}  // namespace
+
+// Morton codes of finite points in a cube: torchrg/neighbors/order.py.
+KERNEL morton_codes(int64_t num_points, const double* points, double x, double y, double z,
+                    double extent, int64_t* codes) {
+  const double low[3] = {x, y, z};
   for (int64_t i = 0; i < num_points; i++) {
     uint64_t code = 0;
     for (int axis = 0; axis < 3; axis++)
@@ -120,19 +118,6 @@ INLINE int64_t fill_codes(int64_t num_points, const T* points, const double (&lo
     codes[i] = int64_t(code);
   }
   return DONE;
-}
-
-}  // namespace
-
-// Morton codes of finite points in a cube: torchrg/neighbors/order.py.
-KERNEL morton_codes(int64_t num_points, const float* points, double x, double y, double z,
-                    double extent, int64_t* codes) {
-  return fill_codes(num_points, points, {x, y, z}, extent, codes);
-}
-
-KERNEL morton_codes_double(int64_t num_points, const double* points, double x, double y, double z,
-                           double extent, int64_t* codes) {
-  return fill_codes(num_points, points, {x, y, z}, extent, codes);
 }
 
 // order.sort_integers: rows that sort keys, ties by row, and the keys in this order; a radix sort by

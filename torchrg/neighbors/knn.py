@@ -323,12 +323,11 @@ def search_rows(
     first, last = np.searchsorted(starts, (query_rows.start, query_rows.stop - 1), side="right") - 1
     pending = np.arange(first, last + 1)
     if len(positions) >= _MIN_FOR_CELLS and kernels.serve(k=k):
-        reach = _estimate_reach(positions, pending[:: -(-len(pending) // _SAMPLE_SIZE)], k)
         if len(positions) == len(points):
-            pending = search_cells(positions, pending, reach, indices, order, first_row)
+            pending = search_cells(positions, pending, indices, order, first_row)
         else:
             found, requested = np.empty((len(positions), k), dtype=np.int32), pending
-            pending = search_cells(positions, requested, reach, found)
+            pending = search_cells(positions, requested, found)
             resolved = np.setdiff1d(requested, pending, assume_unique=True)
             for chunk in split_rows(len(resolved), limit_rows(ROWS_IN_CACHE, k)):
                 store(resolved[chunk], found[resolved[chunk]])
@@ -343,7 +342,6 @@ def search_rows(
 def search_cells(
     points: NDArray[np.float64],
     rows: NDArray[np.int64],
-    reach: NDArray[np.float64],
     found: NDArray[np.int32],
     order: NDArray[np.int64] | None = None,
     first_row: int = 0,
@@ -355,9 +353,8 @@ def search_cells(
     box, including empty cells. The point itself counts. Requires the kernels.
 
     Args:
-        points: Distinct points.
+        points: Distinct points, in canonical order.
         rows: Query rows, ascending.
-        reach: Estimated distances of the k-th neighbor for a sample of the points.
         found: Output neighbors of each point, ``(M, k)``, sorted by distance, then by row.
         order: Row of ``found`` for each point, and its index there. Default: the point's row.
         first_row: Offset added to each index.
@@ -371,7 +368,7 @@ def search_cells(
     target, by_row = torch.from_numpy(found), None if order is None else torch.from_numpy(order)
     certain = torch.zeros(len(points), dtype=torch.bool, device="cpu")
     is_query = torch.zeros_like(certain)
-    for size in _cell_sizes(reach):
+    for size in _cell_sizes(points, rows, found.shape[1]):
         if len(rows) == 0:
             break
         counts = extent / size + 4
@@ -399,22 +396,14 @@ def search_cells(
     return rows
 
 
-def _estimate_reach(
-    points: NDArray[np.float64], rows: NDArray[np.int64], k: int
-) -> NDArray[np.float64]:
-    """Return distances ``(n,)`` within which points in canonical order have k neighbors."""
-    width = min(_WINDOW * k, len(points))
-    starts = np.clip(rows - width // 2, 0, len(points) - width)
-    offsets = points[starts[:, None] + np.arange(width)] - points[rows, None]
+def _cell_sizes(points: NDArray[np.float64], rows: NDArray[np.int64], k: int) -> list[float]:
+    """Return ascending cell sizes that together resolve nearly all of some rows."""
+    sample, width = rows[:: -(-len(rows) // _SAMPLE_SIZE)], min(_WINDOW * k, len(points))
+    starts = np.clip(sample - width // 2, 0, len(points) - width)
+    offsets = points[starts[:, None] + np.arange(width)] - points[sample, None]
     squares = np.partition((offsets * offsets).sum(axis=2), k - 1, axis=1)[:, k - 1]
-    reach: NDArray[np.float64] = np.sqrt(squares)
-    return reach
-
-
-def _cell_sizes(reach: NDArray[np.float64]) -> list[float]:
-    """Return ascending cell sizes that together resolve nearly all of a sample."""
+    reach = np.sqrt(np.sort(squares[squares > 0]))
     sizes: list[float] = []
-    reach = np.sort(reach[reach > 0])
     min_count = int(_MIN_FRACTION * len(reach))
     while len(reach) > min_count:
         sizes.append(_SIZE_STEP * float(reach[min_count]))

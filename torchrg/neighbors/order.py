@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchrg import kernels
 from torchrg._checks import as_tensor, check_points
-from torchrg._parallel import ROWS_AT_ONCE, nonzero_rows, split_rows
+from torchrg._parallel import ROWS_AT_ONCE, map_tasks, nonzero_rows, split_rows
 from torchrg.errors import CloudWarning, warn
 from torchrg.structures import UNLABELED, AnyCloud
 from torchrg.structures.points import bounding_box, short_repr
@@ -199,16 +199,19 @@ def morton_codes(coordinates: NDArray[np.floating]) -> NDArray[np.int64]:
     extent = float((high - low).max())
     if extent == 0:
         return codes
-    kernel = {"f4": "morton_codes", "f8": "morton_codes_double"}.get(coordinates.dtype.str[1:])
-    for rows in split_rows(len(codes), ROWS_AT_ONCE):
-        if kernel and kernels.serve():
-            points = as_tensor("morton_codes", "coordinates", coordinates[rows])
-            codes[rows] = kernels.call(kernel, points, *low.tolist(), extent)[0].numpy()
-            continue
-        relative = (coordinates[rows] - low) / extent
+
+    def work(rows: slice) -> None:
+        positions = coordinates[rows].astype(np.float64)
+        if kernels.serve():
+            points = torch.from_numpy(positions)
+            codes[rows] = kernels.call("morton_codes", points, *low.tolist(), extent)[0].numpy()
+            return
+        relative = (positions - low) / extent
         steps = torch.from_numpy((relative * (2**MORTON_BITS - 1)).astype(np.int64))
         for axis in range(3):
             codes[rows] |= (spread_bits(steps[:, axis]) << axis).numpy()
+
+    map_tasks(work, split_rows(len(codes), ROWS_AT_ONCE), torch.device("cpu"))
     return codes
 
 

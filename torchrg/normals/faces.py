@@ -60,7 +60,18 @@ def find_faces(
     int32, and the sign that makes its normal consistent within the face, ``(N,)`` each. Some face
     IDs are unused.
     """
-    faces, signs = _find_planes(points, normals, labels, axes.to(points), max_thickness)
+    faces = torch.full((len(points),), -1, dtype=torch.int32)
+    signs, rows = normals.new_ones(len(points)), scratch.store(nonzero_rows(labels >= 0))
+    label, axes = scratch.store(labels.index_select(0, rows).long()), axes.to(points)
+    side, is_thin = _split_plates(points, rows, label, axes, max_thickness)
+    for part in split_rows(len(rows), ROWS_AT_ONCE):
+        near_plane, plane = rows[part], label[part]
+        cosine = dot(normals.index_select(0, near_plane), axes.index_select(0, plane))
+        kept = nonzero_rows(is_thin.index_select(0, plane) & (cosine.abs() > _MIN_COSINE))
+        chosen, face = near_plane.index_select(0, kept), 2 * plane + side[part]
+        faces.index_copy_(0, chosen, face.index_select(0, kept).int())
+        signs.index_copy_(0, chosen, cosine.index_select(0, kept).sign())
+    del label, side, rows
     rows = nonzero_rows(faces >= 0)
     joined, signs = _join_patches(points, normals, near, faces, signs, _MIN_AGREEMENT)
     has_plane = torch.zeros(int(joined.max()) + 1, dtype=torch.bool)
@@ -74,27 +85,6 @@ def find_faces(
     side, _ = _split_plates(points, rows, patch, axes, max_thickness)
     joined[rows] += len(has_plane) * side
     return joined, signs
-
-
-def _find_planes(
-    points: Tensor, normals: Tensor, labels: Tensor, axes: Tensor, max_thickness: float
-) -> tuple[Tensor, Tensor]:
-    """Return the faces of thin planes, -1 at other points, and signs; see :func:`find_faces`."""
-    faces = torch.full((len(points),), -1, dtype=torch.int32)
-    signs, rows = normals.new_ones(len(points)), scratch.store(nonzero_rows(labels >= 0))
-    label = scratch.store(labels.index_select(0, rows).long())
-    side, is_thin = _split_plates(points, rows, label, axes, max_thickness)
-
-    def mark(part: slice) -> None:
-        near_plane, plane = rows[part], label[part]
-        cosine = dot(normals.index_select(0, near_plane), axes.index_select(0, plane))
-        kept = nonzero_rows(is_thin.index_select(0, plane) & (cosine.abs() > _MIN_COSINE))
-        chosen, face = near_plane.index_select(0, kept), 2 * plane + side[part]
-        faces.index_copy_(0, chosen, face.index_select(0, kept).int())
-        signs.index_copy_(0, chosen, cosine.index_select(0, kept).sign())
-
-    map_tasks(mark, split_rows(len(rows), ROWS_AT_ONCE), rows.device)
-    return faces, signs
 
 
 def gather_lists(near: Tensor, rows: Tensor, ranks: list[int]) -> Tensor:
@@ -225,15 +215,10 @@ def _find_links(
         scratch.release()
         return tuple(values.view(-1)[: int(count)].clone() for values in found)
     starts, ends = rows.repeat_interleave(len(ranks)), gather_lists(near, rows, ranks).view(-1)
-    cosine, here, there, squares = (points.new_zeros(len(starts)) for _ in range(4))
-    for position, normal in zip(points.unbind(dim=1), normals.unbind(dim=1), strict=True):
-        offset, normal_here, other = position[ends] - position[starts], normal[starts], normal[ends]
-        cosine += other * normal_here
-        here += offset * normal_here
-        there += offset * other
-        squares += offset * offset
+    arms, normal, other = points[ends] - points[starts], normals[starts], normals[ends]
+    here, there, squares = dot(arms, normal), dot(arms, other), dot(arms, arms)
     squares = torch.where(squares > 0, squares, 1.0)
-    cosine -= 2 * here * there / squares
+    cosine = dot(other, normal) - 2 * here * there / squares
     bend = 1 - cosine.abs() + (here * here + there * there) / squares
     chosen = bend <= max_bend
     if groups is not None:
@@ -258,13 +243,12 @@ def _join_faces(
         order, pairs = sort_integers(keys)
         starts = mark_distinct(pairs)
         values = agreement.index_select(0, order).double()
-        # Without links the counts are integers.
         totals = torch.bincount(starts.cumsum(0) - 1, values).double()
         pairs = pairs.index_select(0, nonzero_rows(starts))
         low, high = pairs // count, pairs % count
         agreement = torch.where(low == high, 0.0, totals)
-        owner, other, strength = torch.cat([low, high]), torch.cat([high, low]), agreement.abs()
-        strength = strength.repeat(2)
+        owner, other = torch.cat([low, high]), torch.cat([high, low])
+        strength = agreement.abs().repeat(2)
         limit = torch.where(sizes < _MIN_FACE_POINTS, 0.0, strong * sizes).double()
         limit.scatter_reduce_(0, owner, strength, "amax")
         chosen = nonzero_rows((strength == limit[owner]) & (strength > 0))

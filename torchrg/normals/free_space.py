@@ -53,8 +53,7 @@ def vote_free_side(
     ``rows`` ``(n,)`` vote. Votes ``(n,)`` are positive if the normal points to the freer side.
     """
     at, cell = _mark_cells(points, rows, width)
-    to_low, normal = at[:, cell], normals[rows]
-    to_high = at.max(axis=1, keepdims=True) - to_low
+    normal = normals[rows]
     obstacles = map_tasks(
         lambda chunk: _find_obstacles(points, normals, near, chunk, width),
         torch.split(rows, ROWS_IN_CACHE),
@@ -66,8 +65,7 @@ def vote_free_side(
         stride = math.sqrt(sum(step * step for step in steps))
         cosine = dot(normal, normal.new_tensor(steps)) / stride
         ahead, behind = (
-            torch.from_numpy(score).to(normal)
-            for score in _free_paths(at, cell, to_low, to_high, steps, stride)
+            torch.from_numpy(score).to(normal) for score in _free_paths(at, cell, steps, stride)
         )
         is_front = cosine > 0
         ahead = torch.minimum(ahead, torch.where(is_front, front, back))
@@ -133,27 +131,18 @@ def _find_obstacles(
 
 
 def _free_paths(
-    at: NDArray[np.int32],
-    cell: NDArray[np.int64],
-    to_low: NDArray[np.int32],
-    to_high: NDArray[np.int32],
-    steps: tuple[int, ...],
-    stride: float,
+    at: NDArray[np.int32], cell: NDArray[np.int64], steps: tuple[int, ...], stride: float
 ) -> list[NDArray[np.float32]]:
     """Return the weights of the free paths from some cells in a direction and its opposite.
 
-    Of the occupied cells ``at`` ``(3, C)``, paths start at ``cell`` ``(n,)``, which are ``to_low``
-    and ``to_high`` ``(3, n)`` cells from the ends of the grid. Each is ``(n,)``.
+    Of the occupied cells ``at`` ``(3, C)``, paths start at ``cell`` ``(n,)``. Each is ``(n,)``.
     """
-    scores = []
+    scores, here = [], at.take(cell, axis=1)
+    to_ends = at.max(axis=1, keepdims=True) - here, here
     for gaps, sign in zip(_free_gaps(at, steps), (1, -1), strict=True):
         free = gaps[cell]
-        to_ends = [
-            (to_high if step * sign > 0 else to_low)[axis]
-            for axis, step in enumerate(steps)
-            if step
-        ]
-        path = stride * np.where(free < 0, np.minimum.reduce(to_ends), free).astype(np.float32)
+        ahead = [to_ends[step * sign < 0][axis] for axis, step in enumerate(steps) if step]
+        path = stride * np.where(free < 0, np.minimum.reduce(ahead), free).astype(np.float32)
         weight = np.where(free < 0, np.float32(_OPEN_WEIGHT), np.float32(1))
         scores.append(weight * (path / (path + np.float32(_HALF_PATH))))
     return scores
