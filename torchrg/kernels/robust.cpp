@@ -3,11 +3,17 @@
 // Sums run over the points in order. Columns (K, M) hold point k of patch m at k * M + m.
 #include "plain.h"
 
+// A loop that needs the registers for itself.
+#define SEPARATE __attribute__((noinline))
+
 namespace {
 
-constexpr int QUICK_PASSES = 4;   // counting passes, at half the cost of the other passes
-constexpr int FREE_PASSES = 9;    // passes after which every second one bisects
-constexpr float TYPICAL = 0.42f;  // Qn's difference / length of the shortest half
+constexpr float TYPICAL = 0.42f;       // Qn's difference / length of the shortest half
+constexpr float MARGIN = 0.6f;         // of a window, per difference that a count is off
+constexpr float MIN_MARGIN = 8;        // the same, in differences
+constexpr int MAX_DIFFERENCES = 2048;  // in a window
+constexpr int NUM_WINDOWS = 2;          // rounds before all differences are searched
+constexpr int FREE_TURNS = 4;          // turns after which a search bisects
 
 // One coordinate of the points of eight patches.
 struct Column {
@@ -70,70 +76,145 @@ INLINE Lanes roots_of(Lanes squares) {
 }
 
 INLINE Lanes one_where(Flags flags) { return where(flags, all(1), all(0)); }
-INLINE bool is_any(Flags flags) { return total(flags) != 0; }
+// Whether a lane is negative, such as true.
+INLINE bool is_any(Flags flags) {
+#ifdef __AVX__
+  return __builtin_ia32_movmskps256((Lanes)flags) != 0;
+#elif defined(__SSE__)
+  return __builtin_ia32_movmskps((FourFloats)(flags.low | flags.high)) != 0;
+#else
+  return total(flags >> 31) != 0;
+#endif
+}
 
-struct Around {
-  Lanes count;         // differences at most the pivot
-  Lanes below, above;  // the largest of them, and the smallest above; the pivot if not searched
+// Limits of a value: `few` values, too few, are at most `low`, and `many` at most `high`.
+struct Bracket {
+  Lanes wanted, low, high, few, many;
+
+  INLINE_MEMBER void narrow(Lanes limit, Lanes count) {
+    const Flags is_few = count < wanted;
+    const Flags moves_low = is_few & (limit > low), moves_high = ~is_few & (limit < high);
+    low = where(moves_low, limit, low), few = where(moves_low, count, few);
+    high = where(moves_high, limit, high), many = where(moves_high, count, many);
+  }
 };
 
-// Looks at lags until one has no difference within the pivot: larger lags have none either.
-template <bool looks>
-INLINE Around look_around(const Column& rows, int n, Lanes pivot) {
-  Around found{Lanes{}, looks ? Lanes{} : pivot, looks ? all(INFINITE) : pivot};
+// Calls `visit` with the differences of sorted rows lag by lag, until one has no difference within
+// some limit, where `visit` returns true: larger lags have none either.
+template <class Visit>
+INLINE void visit_differences(const Column& rows, int n, const Visit& visit) {
   for (int lag = 1; lag <= n / 2; lag++) {
-    Flags at_lag{};
-    for (int i = 0; i < n - lag; i++) {
-      const Lanes difference = rows[i + lag] - rows[i];
-      const Flags within = difference <= pivot;
-      at_lag += within;
-      if (!looks) continue;
-      found.below = larger(found.below, where(within, difference, all(0)));
-      found.above = smaller(found.above, where(within, all(INFINITE), difference));
-    }
-    if (!is_any(at_lag)) break;
-    found.count -= to_float(at_lag);
+    Flags is_within{};
+    for (int i = 0; i < n - lag; i++) is_within = is_within | visit(rows[i + lag] - rows[i]);
+    if (!is_any(is_within)) break;
   }
-  return found;
 }
+
+SEPARATE static Lanes count_differences(const Column& rows, int n, Lanes pivot) {
+  Flags count{};
+  visit_differences(rows, n, [&](Lanes difference) {
+    const Flags is_within = difference <= pivot;
+    count -= is_within;
+    return is_within;
+  });
+  return to_float(count);
+}
+
+struct Around {
+  Flags count;         // differences at most a pivot
+  Lanes below, above;  // the largest of them, and the smallest above
+
+  INLINE_MEMBER Flags add(Lanes difference, Lanes pivot) {
+    const Flags is_within = difference <= pivot;
+    count -= is_within;
+    below = larger(below, where(is_within, difference, all(0)));
+    above = smaller(above, where(is_within, all(INFINITE), difference));
+    return is_within;
+  }
+};
+
+// The differences of sorted rows in a window (first, last] of their lane, infinite outside.
+struct Window {
+  Flags below, within;  // number of differences up to its limits
+  int size;             // -1 if there are too many
+  alignas(32) float values[(MAX_DIFFERENCES + 1) * LANES];
+
+  SEPARATE void collect(const Column& rows, int n, Lanes first, Lanes last) {
+    Flags up_to_first{}, up_to_last{};
+    unsigned found = 0;
+    visit_differences(rows, n, [&](Lanes difference) {
+      const Flags is_below = difference <= first, is_within = difference <= last;
+      const Flags is_inside = is_within & ~is_below;
+      up_to_first -= is_below, up_to_last -= is_within;
+      store(values + found % MAX_DIFFERENCES * LANES, where(is_inside, difference, all(INFINITE)));
+      found += is_any(is_inside);
+      return is_within;
+    });
+    below = up_to_first, within = up_to_last, size = found < MAX_DIFFERENCES ? int(found) : -1;
+    store(values + found % MAX_DIFFERENCES * LANES, all(INFINITE));
+  }
+
+  SEPARATE Around look_around(const Column& rows, int n, Lanes pivot) const {
+    Around around{size < 0 ? Flags{} : below, Lanes{}, all(INFINITE)}, other{Flags{}, Lanes{}, all(INFINITE)};
+    for (int i = 0; i < size; i += 2) {
+      around.add(load(values + i * LANES), pivot);
+      other.add(load(values + (i + 1) * LANES), pivot);
+    }
+    around = {around.count + other.count, larger(around.below, other.below), smaller(around.above, other.above)};
+    if (size < 0)
+      visit_differences(rows, n, [&](Lanes difference) { return around.add(difference, pivot); });
+    return around;
+  }
+};
 
 // The C(h, 2)-th smallest difference of each lane of sorted rows; NaN if one may be infinite.
 //
-// Regula falsi (Illinois): differences up to `low` are too few, those up to `high` enough, such as
-// the length of the shortest half. Counts are `missing` and in `excess` there.
-Lanes majority_difference(const Column& rows, int n) {
+// Counting the differences up to a typical one leads to a window around the result. Regula falsi
+// searches the few differences in the window; where it misses, those up to the shortest half.
+SEPARATE Lanes majority_difference(const Column& rows, int n) {
+  Window window;
   const int lags = n / 2, rank = lags * (lags + 1) / 2;
   const Lanes wanted = all(rank - 0.5f), spread = rows[n - 1] - rows[0];
-  Lanes low{}, high = spread, missing = wanted, excess = wanted;
-  for (int i = 0; i + lags < n; i++) high = smaller(high, rows[i + lags] - rows[i]);
-  Lanes pivot = high * TYPICAL;
+  Lanes shortest = spread;
+  for (int i = 0; i + lags < n; i++) shortest = smaller(shortest, rows[i + lags] - rows[i]);
+  Flags ties{};
+  for (int i = 0; i + 1 < n; i++) ties -= rows[i + 1] - rows[i] <= 0;
+  const Flags may_be_zero = ties >= Flags{} + lags;
+  const Lanes pivot = where(may_be_zero, all(0), shortest * TYPICAL);
+  Bracket bracket{wanted, where(may_be_zero, all(-1), all(0)), shortest, Lanes{}, wanted / TYPICAL};
+  bracket.narrow(pivot, count_differences(rows, n, pivot));
   Lanes result = where(spread < INFINITE, Lanes{}, all(__builtin_nanf("")));
-  Flags open = (high > 0) & (spread < INFINITE), was_few{}, was_many{};
-  bool looks = false;
-  for (int turn = 0; is_any(open); turn++) {
-    looks |= turn >= QUICK_PASSES;
-    const Around found =
-        looks ? look_around<true>(rows, n, pivot) : look_around<false>(rows, n, pivot);
-    const Lanes gap = found.count - wanted;
-    const Flags few = gap < 0, next_to = magnitude(gap) < 1;
-    const Flags ends = where(few, found.above >= high, found.below <= low);
-    const Lanes end = where(few, where(next_to, found.above, high), found.below);
-    const Flags done = open & (looks ? next_to | ends : ends & ~next_to);
-    result = where(done, end, result), open = open & ~done;
-    const Flags moves = open & ~next_to, moves_low = moves & few, moves_high = moves & ~few;
-    looks = !is_any(moves);
-    low = where(moves_low, pivot, low), high = where(moves_high, found.below, high);
-    // The limit that stays twice counts half.
-    missing = where(moves_low, -gap, where(moves_high & was_many, missing * 0.5f, missing));
-    excess = where(moves_high, gap, where(moves_low & was_few, excess * 0.5f, excess));
-    was_few = where(moves, few, was_few), was_many = where(moves, ~few, was_many);
-    const auto inside = [&](Lanes value) { return (value > low) & (value < high); };
-    Lanes next = low + (high - low) * (missing / (missing + excess));
-    if (turn > FREE_PASSES && turn % 2) next = low;
-    next = where(inside(next), next, low + (high - low) * 0.5f);
-    pivot = where(moves, where(inside(next), next, low), pivot);
+  Flags open = (shortest > 0) & (spread < INFINITE);
+  for (int round = 0; is_any(open); round++) {
+    const Lanes missing = wanted - bracket.few, excess = bracket.many - wanted;
+    const Lanes off = smaller(missing, excess);
+    const Lanes margin = smaller(off * MARGIN + all(MIN_MARGIN), all(MAX_DIFFERENCES / 16));
+    const Lanes step = (bracket.high - bracket.low) / (missing + excess);
+    Lanes first = bracket.low, last = bracket.high;
+    if (round < NUM_WINDOWS) first = larger(first, bracket.low + step * (missing - margin));
+    if (round < NUM_WINDOWS) last = smaller(last, bracket.low + step * (missing + margin));
+    window.collect(rows, n, where(open, first, last), last);
+    bracket.narrow(first, to_float(window.below)), bracket.narrow(last, to_float(window.within));
+    Flags searched = open & (to_float(window.below) < wanted) & (to_float(window.within) > wanted);
+    open = open & ~searched;
+    Bracket inside = bracket;
+    Lanes least = inside.low;
+    for (int turn = 0; is_any(searched); turn++) {
+      const Lanes part = (wanted - inside.few) / (inside.many - inside.few);
+      const Lanes length = inside.high - inside.low;
+      Lanes next = larger(inside.low + length * (turn < FREE_TURNS ? part : all(0.5f)), least);
+      next = where(next < inside.high, next, inside.low);
+      const Around around = window.look_around(rows, n, next);
+      const Lanes found = to_float(around.count);
+      const Flags is_few = found < wanted, is_next = magnitude(found - wanted) < 1;
+      const Flags done = searched & (is_next | (is_few & (around.above >= inside.high)));
+      result = where(done, where(is_few, around.above, around.below), result);
+      searched = searched & ~done;
+      inside.narrow(where(is_few, next, around.below), found);
+      least = where(is_few, around.above, least);
+    }
   }
-  return result;
+  return result + all(0);
 }
 
 Lanes sort_and_scale(Column& rows, int n, double factor) {
@@ -238,7 +319,7 @@ struct Job {
 // torchrg.robust.scale._majority_difference of sorted rows; NaN where a difference is not finite.
 KERNEL majority_differences(int64_t num_rows, int64_t n, Floats rows, float* found) {
   if (n < 2 || n > MAX_WIDTH) return TOO_WIDE;
-  static thread_local Column lanes;
+  Column lanes;
   for (int64_t i = 0; i < num_rows; i += LANES) {
     for (int l = 0; l < LANES; l++)
       for (int k = 0; k < n; k++) lanes.at(k, l) = rows[smaller(i + l, num_rows - 1) * n + k];
@@ -255,7 +336,7 @@ KERNEL may_have_flats(int64_t n, int64_t M, int64_t S, Floats x, Floats y, Float
   if (n < 1 || n > MAX_WIDTH) return TOO_WIDE;
   for (int64_t i = 0; i < 4 * S; i++)
     if (vertices[i] < 0 || vertices[i] >= n) return NO_SUCH_ROW;
-  static thread_local Points points;
+  Points points;
   for (int64_t m = 0; m < M; m += LANES) {
     load_points(x, y, z, int(n), m, M, points);
     const Lanes limit = load_row(tolerance, m, M) * all(4);
@@ -292,7 +373,7 @@ KERNEL may_have_flats(int64_t n, int64_t M, int64_t S, Floats x, Floats y, Float
 // starts._centers_and_scales: median and majority difference of each column.
 KERNEL lane_scales(int64_t n, int64_t M, Floats values, float* medians, float* differences) {
   if (n < 2 || n > MAX_WIDTH) return TOO_WIDE;
-  static thread_local Column rows;
+  Column rows;
   for (int64_t m = 0; m < M; m += LANES) {
     load_column(values, int(n), m, M, rows);
     sort_lanes(rows, int(n));
@@ -305,7 +386,7 @@ KERNEL lane_scales(int64_t n, int64_t M, Floats values, float* medians, float* d
 // lanes.smallest_points.
 KERNEL smallest_points(int64_t n, int64_t M, Floats values, int64_t size, float* marks) {
   if (n < 1 || n > MAX_WIDTH || size < 1 || size > n) return TOO_WIDE;
-  static thread_local Column column, found;
+  Column column, found;
   for (int64_t m = 0; m < M; m += LANES) {
     load_column(values, int(n), m, M, column);
     mark_smallest(column, int(n), int(size), found);
@@ -319,8 +400,8 @@ KERNEL scatter_matrices(int64_t n, int64_t M, int64_t T, Floats x, Floats y, Flo
                         Floats ty, Floats tz, Floats lengths, Floats scores, double factor,
                         float* matrices) {
   if (n < 2 || n > MAX_WIDTH || T <= 2 * n) return TOO_WIDE;
-  static thread_local Points points, others;
-  static thread_local Column ones, half, norms;
+  Points points, others;
+  Column ones, half, norms;
   const int count = int(n);
   for (int k = 0; k < n; k++) ones.set(k, all(1));
   for (int64_t m = 0; m < M; m += LANES) {
@@ -365,8 +446,8 @@ KERNEL scatter_matrices(int64_t n, int64_t M, int64_t T, Floats x, Floats y, Flo
 KERNEL sphered_sets(int64_t n, int64_t M, int64_t S, Floats x, Floats y, Floats z, Floats loadings,
                     double factor, int64_t size, float* sets, bool* undefined) {
   if (n < 2 || n > MAX_WIDTH || size < 1 || size > n) return TOO_WIDE;
-  static thread_local Points points, sphered;
-  static thread_local Column score, rows;
+  Points points, sphered;
+  Column score, rows;
   for (int64_t m = 0; m < M; m += LANES) {
     load_points(x, y, z, int(n), m, M, points);
     for (int64_t s = 0; s < S; s++) {
@@ -416,8 +497,8 @@ KERNEL concentrate(int64_t n, int64_t M, int64_t S, Floats x, Floats y, Floats z
                    Floats floor, int64_t initial_size, int64_t size, int64_t max_steps,
                    float* final, double* best) {
   if (n < 1 || n > MAX_WIDTH || size < 1 || size > n) return TOO_WIDE;
-  static thread_local Points points, residuals;
-  static thread_local Column members, distances, marks;
+  Points points, residuals;
+  Column members, distances, marks;
   Job jobs[LANES];
   float floors[LANES] = {}, sizes[LANES] = {};
   int64_t next = 0;
@@ -466,7 +547,7 @@ KERNEL are_coplanar(int64_t num_points, int64_t num_rows, int64_t k, Floats poin
                     Ints indices, Flagged tested, double factor, double floor_fraction,
                     bool* passed, bool* open) {
   if (k < 1 || k > MAX_WIDTH) return TOO_WIDE;
-  static thread_local Column residuals, sorted;
+  Column residuals, sorted;
   int64_t rows[LANES];
   int used = 0;
   for (int64_t q = 0; q < num_rows; q++) {
