@@ -239,17 +239,22 @@ KERNEL connected(int64_t num_points, int64_t k, int64_t num_rows, Ints indices, 
       if (!are_rows(indices + list, k, num_points)) return NO_SUCH_ROW;
       for (uint64_t& word : bits[m]) word = 0;
       for (int64_t e = list; e < list + k; e++) {
-        const int number = !mask || mask[e] ? find(indices[e]) : -1;
-        if (number >= 0) bits[m][number / 64] |= uint64_t(1) << number % 64;
+        // Without branches, which would be unpredictable.
+        const uint32_t number = smaller(uint32_t(numbers[indices[e]]), uint32_t(count - 1));
+        const bool is_member = (members[number] == indices[e]) & (!mask || mask[e]);
+        bits[m][number / 64] |= uint64_t(is_member) << number % 64;
       }
     }
-    for (int64_t e = start * k, edge = e - first * k; e < stop * k; e++, edge++) {
-      const int one = selected[edge] ? find(e / k) : -1,
-                other = selected[edge] ? find(indices[e]) : -1;
-      int64_t shared = 0;
-      for (int word = 0; one >= 0 && other >= 0 && word < WORDS; word++)
-        shared += __builtin_popcountll(bits[one][word] & bits[other][word]);
-      joined[edge] = selected[edge] && shared >= min_shared;
+    for (int64_t row = start; row < stop; row++) {
+      const int one = find(row);
+      for (int64_t e = row * k, edge = e - first * k; e < (row + 1) * k; e++, edge++) {
+        const int other = selected[edge] ? find(indices[e]) : -1;
+        int shared = 0;
+        if (one >= 0 && other >= 0)
+          for (int word = 0; word < WORDS; word++)
+            shared += __builtin_popcountll(bits[one][word] & bits[other][word]);
+        joined[edge] = selected[edge] && shared >= min_shared;
+      }
     }
   }
   return DONE;
