@@ -22,6 +22,13 @@ struct Column {
   INLINE_MEMBER Lanes operator[](int k) const { return load(values + k * LANES); }
   INLINE_MEMBER void set(int k, Lanes lanes) { store(values + k * LANES, lanes); }
   INLINE_MEMBER float& at(int k, int lane) { return values[k * LANES + lane]; }
+  // Whole lanes are stored, which can be loaded at once.
+  INLINE_MEMBER void replace(Flags lanes, const Column& other, int n) {
+    for (int k = 0; k < n; k++) set(k, where(lanes, other[k], (*this)[k]));
+  }
+  INLINE_MEMBER void replace(Flags lanes, const Column& other, int64_t lane, int n) {
+    for (int k = 0; k < n; k++) set(k, where(lanes, all(other.values[k * LANES + lane]), (*this)[k]));
+  }
 };
 
 struct Points {
@@ -39,8 +46,9 @@ INLINE void store_row(float* row, int64_t m, int64_t num_patches, Lanes lanes) {
   if (m + LANES <= num_patches) return store(row + m, lanes);
   for (int l = 0; m + l < num_patches; l++) row[m + l] = lanes[l];
 }
-INLINE void load_column(const float* values, int n, int64_t m, int64_t M, Column& column) {
-  for (int k = 0; k < n; k++) column.set(k, load_row(values + k * M, m, M));
+INLINE void load_column(const float* values, int n, int64_t m, int64_t M, Column& column,
+                        int64_t num_starts = 1) {
+  for (int k = 0; k < n; k++) column.set(k, load_row(values + k * num_starts * M, m, M));
 }
 INLINE void load_points(Floats x, Floats y, Floats z, int n, int64_t m, int64_t M, Points& points) {
   load_column(x, n, m, M, points.columns[0]);
@@ -497,26 +505,34 @@ KERNEL concentrate(int64_t n, int64_t M, int64_t S, Floats x, Floats y, Floats z
                    Floats floor, int64_t initial_size, int64_t size, int64_t max_steps,
                    float* final, double* best) {
   if (n < 1 || n > MAX_WIDTH || size < 1 || size > n) return TOO_WIDE;
-  Points points, residuals;
-  Column members, distances, marks;
+  Points points, residuals, around;
+  Column members, distances, marks, starts;
   Job jobs[LANES];
   float floors[LANES] = {}, sizes[LANES] = {};
+  // Eight patches start together, as neighbors in memory.
+  const int64_t count = (M + LANES - 1) / LANES * LANES * S;
   int64_t next = 0;
   int active = 0;
   const auto enter = [&](int l) {
-    Job& job = jobs[l] = {next < M * S ? next / S : -1, next % larger(S, int64_t(1)), -1, INFINITE};
-    if (job.patch < 0) return;
-    next++, active++, floors[l] = floor[job.patch], sizes[l] = float(initial_size);
-    for (int k = 0; k < n; k++) {
-      const int64_t i = k * M + job.patch;
-      points.columns[0].at(k, l) = x[i], points.columns[1].at(k, l) = y[i];
-      points.columns[2].at(k, l) = z[i];
-      members.at(k, l) = initial[(k * S + job.start) * M + job.patch];
+    while (next < count && next / LANES / S * LANES + next % LANES >= M) next++;
+    Job& job = jobs[l] = {-1, next / LANES % larger(S, int64_t(1)), -1, INFINITE};
+    if (next >= count) return;
+    const int64_t first = next / LANES / S * LANES, lane = next++ % LANES;
+    if (lane == 0) {
+      if (job.start == 0) load_points(x, y, z, int(n), first, M, around);
+      load_column(initial + job.start * M, int(n), first, M, starts, S);
     }
+    job.patch = first + lane, active++, floors[l] = floor[job.patch], sizes[l] = float(initial_size);
+    int32_t flags[LANES] = {};
+    flags[l] = -1;
+    for (int i = 0; i < 3; i++)
+      points.columns[i].replace(load(flags), around.columns[i], lane, int(n));
+    members.replace(load(flags), starts, lane, int(n));
   };
   for (int l = 0; l < LANES; l++) enter(l);
   while (active > 0) {
     Lanes squares[3], common{};
+    int32_t moved[LANES] = {};
     fit_lanes(points, members, int(n), load(sizes), load(floors), residuals, distances, squares);
     mark_smallest(distances, int(n), int(size), marks);
     for (int k = 0; k < n; k++) common += marks[k] * members[k];
@@ -530,14 +546,14 @@ KERNEL concentrate(int64_t n, int64_t M, int64_t S, Floats x, Floats y, Floats z
       if (job.step < 0 || moves) {
         // The first step leads from the initial set to one of the full size.
         if (job.step++ >= 0) job.previous = value;
-        sizes[l] = float(size);
-        for (int k = 0; k < n; k++) members.at(k, l) = marks.at(k, l);
+        sizes[l] = float(size), moved[l] = -1;
         continue;
       }
       for (int k = 0; k < n; k++) final[(k * S + job.start) * M + job.patch] = members.at(k, l);
       best[job.start * M + job.patch] = value;
       active--, enter(l);
     }
+    members.replace(load(moved), marks, int(n));
   }
   return DONE;
 }
