@@ -244,15 +244,19 @@ void mark_smallest(const Column& values, int n, int size, Column& marks) {
   }
 }
 
-// Writes an entry of symmetric matrices (M, 3, 3).
-INLINE void write_entry(float* matrices, int i, int j, int64_t m, int64_t M, Lanes entry) {
-  for (int l = 0; l < LANES && m + l < M; l++)
-    matrices[(m + l) * 9 + 3 * i + j] = matrices[(m + l) * 9 + 3 * j + i] = entry[l];
-}
+// A symmetric matrix: xx xy xz yy yz zz.
+struct Matrix {
+  Lanes entries[6];
 
-// Writes weighted second moments, about the mean or zero, to matrices (M, 3, 3).
-void write_moments(const Points& points, const Column& weights, bool is_centered, int n, int64_t m,
-                   int64_t M, float* matrices) {
+  INLINE_MEMBER Lanes& operator()(int i, int j) {
+    return entries[i <= j ? i * (5 - i) / 2 + j : j * (5 - j) / 2 + i];
+  }
+};
+
+// Weighted second moments about the mean or zero.
+SEPARATE static Matrix find_moments(const Points& points, const Column& weights, int n,
+                                    bool is_centered) {
+  Matrix found;
   Lanes center[3], count{};
   for (int k = 0; k < n; k++) count += weights[k];
   for (int i = 0; i < 3; i++) {
@@ -265,8 +269,60 @@ void write_moments(const Points& points, const Column& weights, bool is_centered
       const Column &a = points.columns[i], &b = points.columns[j];
       Lanes sum{};
       for (int k = 0; k < n; k++) sum += weights[k] * (a[k] - center[i]) * (b[k] - center[j]);
-      write_entry(matrices, i, j, m, M, sum);
+      found(i, j) = sum;
     }
+  return found;
+}
+
+// starts._correlation.
+INLINE void correlate(Matrix& matrix) {
+  Lanes spread[3];
+  for (int i = 0; i < 3; i++) {
+    const Lanes root = roots_of(matrix(i, i));
+    spread[i] = where(root > 0, root, all(1));
+  }
+  for (int i = 0; i < 3; i++)
+    for (int j = i; j < 3; j++)
+      matrix(i, j) = i == j ? all(1) : matrix(i, j) / (spread[i] * spread[j]);
+}
+
+// eigen.eigh3: unit eigenvectors as columns by ascending eigenvalue; false where one is infinite.
+SEPARATE static Flags decompose(Matrix& matrix, Lanes (&vectors)[3][3]) {
+  constexpr int SWEEPS = 5;
+  Lanes scale{}, zero{};
+  for (const Lanes entry : matrix.entries)
+    scale = larger(scale, magnitude(entry)), zero += entry * all(0);
+  for (Lanes& entry : matrix.entries) entry = entry / where(scale > 0, scale, all(1));
+  for (int i = 0; i < 3; i++)
+    for (int j = 0; j < 3; j++) vectors[i][j] = all(i == j);
+  for (int turn = 0; turn < 3 * SWEEPS; turn++) {
+    const int p = turn % 3 == 2, q = turn % 3 ? 2 : 1, r = 3 - p - q;
+    const Lanes between = matrix(p, q), low = matrix(r, p), high = matrix(r, q);
+    const Flags is_zero = (between <= 0) & (between >= 0);
+    const Lanes tau = (matrix(q, q) - matrix(p, p)) / (where(is_zero, all(1), between) * 2);
+    const Lanes sign = where(tau >= 0, all(1), all(-1));
+    const Lanes tangent = sign / (magnitude(tau) + roots_of(tau * tau + all(1)));
+    const Lanes t = where(is_zero, Lanes{}, tangent);
+    const Lanes cosine = all(1) / roots_of(t * t + all(1)), sine = t * cosine;
+    matrix(p, p) = matrix(p, p) - t * between, matrix(q, q) = matrix(q, q) + t * between;
+    matrix(r, p) = cosine * low - sine * high, matrix(r, q) = sine * low + cosine * high;
+    matrix(p, q) = Lanes{};
+    for (Lanes(&row)[3] : vectors) {
+      const Lanes first = row[p], second = row[q];
+      row[p] = cosine * first - sine * second, row[q] = sine * first + cosine * second;
+    }
+  }
+  for (int turn = 0; turn < 3; turn++) {
+    const int low = turn % 2, high = low + 1;
+    const Flags swaps = matrix(high, high) < matrix(low, low);
+    const auto order = [&](Lanes& a, Lanes& b) {
+      const Lanes first = a;
+      a = where(swaps, b, a), b = where(swaps, first, b);
+    };
+    order(matrix(low, low), matrix(high, high));
+    for (Lanes(&row)[3] : vectors) order(row[low], row[high]);
+  }
+  return zero <= 0;
 }
 
 // starts._double_ranks of each lane.
@@ -403,99 +459,81 @@ KERNEL smallest_points(int64_t n, int64_t M, Floats values, int64_t size, float*
   return DONE;
 }
 
-// starts._scatter_matrices; the first three are covariances, not yet correlations.
-KERNEL scatter_matrices(int64_t n, int64_t M, int64_t T, Floats x, Floats y, Floats z, Floats tx,
-                        Floats ty, Floats tz, Floats lengths, Floats scores, double factor,
-                        float* matrices) {
-  if (n < 2 || n > MAX_WIDTH || T <= 2 * n) return TOO_WIDE;
-  Points points, others;
-  Column ones, half, norms;
-  const int count = int(n);
+// starts._define_sets: the six deterministic starts, and where the definition must find them, since
+// a scale is zero or a number infinite.
+KERNEL deterministic_sets(int64_t num_points, int64_t M, int64_t T, Floats x, Floats y, Floats z,
+                          Floats tx, Floats ty, Floats tz, Floats scores, double factor,
+                          int64_t size, float* sets, bool* undefined) {
+  constexpr int STARTS = 6;
+  constexpr float MIN_LENGTH = 0x1p-23f;  // the machine epsilon
+  if (num_points < 2 || num_points > MAX_WIDTH || size < 1 || size > num_points) return TOO_WIDE;
+  if (T <= 2 * num_points) return TOO_WIDE;
+  const int n = int(num_points);
+  Points points, moved;
+  Column ones, rows, norms;
   for (int k = 0; k < n; k++) ones.set(k, all(1));
   for (int64_t m = 0; m < M; m += LANES) {
-    float* found = matrices;
-    const auto write = [&](const Points& moved, const Column& weights, bool is_centered = true) {
-      write_moments(moved, weights, is_centered, count, m, M, found);
-      found += 9 * M;
-    };
-    load_points(x, y, z, count, m, M, points), load_points(tx, ty, tz, count, m, M, others);
-    write(others, ones);
-    for (int i = 0; i < 3; i++) rank_points(points.columns[i], count, others.columns[i]);
-    write(others, ones);
-    for (Column& column : others.columns)
+    Matrix scatters[STARTS];
+    load_points(x, y, z, n, m, M, points), load_points(tx, ty, tz, n, m, M, moved);
+    scatters[0] = find_moments(moved, ones, n, true);
+    for (int i = 0; i < 3; i++) rank_points(points.columns[i], n, moved.columns[i]);
+    scatters[1] = find_moments(moved, ones, n, true);
+    for (Column& column : moved.columns)
       for (int k = 0; k < n * LANES; k++) column.values[k] = scores[int(column.values[k])];
-    write(others, ones);
+    scatters[2] = find_moments(moved, ones, n, true);
     for (int k = 0; k < n; k++) {
-      const Lanes length = load_row(lengths + k * M, m, M);
       const Lanes u = points.columns[0][k], v = points.columns[1][k], w = points.columns[2][k];
-      for (int i = 0; i < 3; i++) others.columns[i].set(k, points.columns[i][k] / length);
-      norms.set(k, u * u + v * v + w * w);
+      const Lanes square = u * u + v * v + w * w, root = roots_of(square);
+      const Lanes length = where(root > MIN_LENGTH, root, all(1));
+      moved.columns[0].set(k, u / length), moved.columns[1].set(k, v / length);
+      moved.columns[2].set(k, w / length), norms.set(k, square);
     }
-    write(others, ones, false);
-    mark_smallest(norms, count, (count + 1) / 2, half);
-    write(points, half);
-    for (int i = 0; i < 3; i++) {
-      write_entry(found, i, i, m, M, all(1));
-      for (int j = i + 1; j < 3; j++) {
+    scatters[3] = find_moments(moved, ones, n, false);
+    mark_smallest(norms, n, (n + 1) / 2, rows);
+    scatters[4] = find_moments(points, rows, n, true);
+    for (int i = 0; i < 3; i++)
+      for (int j = i; j < 3; j++) {
         const Column &a = points.columns[i], &b = points.columns[j];
-        for (int k = 0; k < n; k++) norms.set(k, a[k] + b[k]);
-        const Lanes sum = sort_and_scale(norms, count, factor);
-        for (int k = 0; k < n; k++) norms.set(k, a[k] - b[k]);
-        const Lanes difference = sort_and_scale(norms, count, factor);
-        write_entry(found, i, j, m, M, (sum * sum - difference * difference) / all(4));
+        for (int k = 0; k < n; k++) rows.set(k, a[k] + b[k]);
+        const Lanes sum = i == j ? all(2) : sort_and_scale(rows, n, factor);
+        for (int k = 0; k < n; k++) rows.set(k, a[k] - b[k]);
+        const Lanes difference = i == j ? Lanes{} : sort_and_scale(rows, n, factor);
+        scatters[5](i, j) = (sum * sum - difference * difference) / all(4);
       }
-    }
-  }
-  return DONE;
-}
-
-// starts._sphered_distances, and the `size` nearest points; the sets of starts with a zero or
-// infinite scale are undefined.
-KERNEL sphered_sets(int64_t n, int64_t M, int64_t S, Floats x, Floats y, Floats z, Floats loadings,
-                    double factor, int64_t size, float* sets, bool* undefined) {
-  if (n < 2 || n > MAX_WIDTH || size < 1 || size > n) return TOO_WIDE;
-  Points points, sphered;
-  Column score, rows;
-  for (int64_t m = 0; m < M; m += LANES) {
-    load_points(x, y, z, int(n), m, M, points);
-    for (int64_t s = 0; s < S; s++) {
-      Flags unscaled{};
+    Flags fails{};
+    for (int start = 0; start < STARTS; start++) {
+      Lanes axes[3][3];
+      if (start < 3) correlate(scatters[start]);
+      fails = fails | ~decompose(scatters[start], axes);
       for (int d = 0; d < 3; d++) {
-        float axes[3][LANES];
-        for (int i = 0; i < 3; i++)
-          for (int64_t l = 0; l < LANES; l++)
-            axes[i][l] = loadings[((s * M + smaller(m + l, M - 1)) * 3 + i) * 3 + d];
-        const Lanes axis[3] = {load(axes[0]), load(axes[1]), load(axes[2])};
+        for (int k = 0; k < n; k++)
+          norms.set(k, points.columns[0][k] * axes[0][d] + points.columns[1][k] * axes[1][d] +
+                           points.columns[2][k] * axes[2][d]);
+        rows = norms;
+        const Lanes scale = sort_and_scale(rows, n, factor);
+        fails = fails | ~(scale > 0);
         for (int k = 0; k < n; k++) {
-          const Lanes value = points.columns[0][k] * axis[0] + points.columns[1][k] * axis[1] +
-                              points.columns[2][k] * axis[2];
-          score.set(k, value), rows.set(k, value);
-        }
-        const Lanes scale = sort_and_scale(rows, int(n), factor);
-        unscaled += ~(scale > all(0));
-        for (int k = 0; k < n; k++) {
-          const Lanes value = score[k] / scale;
+          const Lanes value = norms[k] / scale;
           for (int i = 0; i < 3; i++) {
-            const Lanes part = value * axis[i];
-            sphered.columns[i].set(k, d ? sphered.columns[i][k] + part : part);
+            const Lanes part = value * axes[i][d];
+            moved.columns[i].set(k, d ? moved.columns[i][k] + part : part);
           }
         }
       }
       for (int i = 0; i < 3; i++) {
-        const Column& column = sphered.columns[i];
+        const Column& column = moved.columns[i];
         rows = column;
-        sort_lanes(rows, int(n));
-        const Lanes center = median_of_sorted(rows, int(n));
+        sort_lanes(rows, n);
+        const Lanes center = median_of_sorted(rows, n);
         for (int k = 0; k < n; k++) {
           const Lanes away = column[k] - center;
-          score.set(k, i ? score[k] + away * away : away * away);
+          norms.set(k, i ? norms[k] + away * away : away * away);
         }
       }
-      mark_smallest(score, int(n), int(size), rows);
-      for (int k = 0; k < n; k++) store_row(sets + (k * S + s) * M, m, M, rows[k]);
-      for (int64_t l = 0; l < LANES && m + l < M; l++)
-        undefined[s * M + m + l] = unscaled[int(l)] != 0;
+      mark_smallest(norms, n, int(size), rows);
+      for (int k = 0; k < n; k++) store_row(sets + (k * STARTS + start) * M, m, M, rows[k]);
     }
+    for (int64_t l = 0; l < LANES && m + l < M; l++) undefined[m + l] = fails[int(l)] != 0;
   }
   return DONE;
 }

@@ -1,5 +1,6 @@
 """Eigenvectors of many symmetric 3x3 matrices in closed form."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -12,7 +13,7 @@ from torchrg._checks import (
     is_jit_traced,
     raise_forward_mode,
 )
-from torchrg.linalg.precision import rank_tolerance
+from torchrg.linalg.precision import rank_tolerance, rounded_sqrt
 
 _JACOBI_SWEEPS = 5
 """Number of sweeps over all three pairs after which 3x3 matrices are diagonal to rounding in either
@@ -104,8 +105,15 @@ class _ReverseOnly(_Eigh3):
         raise_forward_mode("eigh3")
 
 
-def _jacobi(matrices: Tensor) -> tuple[Tensor, Tensor]:
-    """Implement :func:`eigh3` without gradient."""
+def rounded_eigenvectors3(matrices: Tensor) -> Tensor:
+    """Return the eigenvectors of :func:`eigh3` without gradient, rounded as in kernels."""
+    return _jacobi(matrices, rounded_sqrt)[1]
+
+
+def _jacobi(
+    matrices: Tensor, root: Callable[[Tensor], Tensor] = torch.sqrt
+) -> tuple[Tensor, Tensor]:
+    """Implement :func:`eigh3` without gradient, with square roots by ``root``."""
     scale = matrices.abs().amax(dim=(-2, -1))
     safe = torch.where(scale > 0, scale, 1.0)[..., None, None]
     scaled = matrices / safe
@@ -115,7 +123,7 @@ def _jacobi(matrices: Tensor) -> tuple[Tensor, Tensor]:
     v = [[one if i == j else zero for j in range(3)] for i in range(3)]
     for _ in range(_JACOBI_SWEEPS):
         for p, q, r in ((0, 1, 2), (0, 2, 1), (1, 2, 0)):
-            _rotate(a, v, p, q, r)
+            _rotate(a, v, (p, q, r), root)
     values = torch.stack([a[i][i] for i in range(3)], dim=-1)
     vectors = torch.stack([torch.stack(row, dim=-1) for row in v], dim=-2)
     values, order = values.sort(dim=-1)
@@ -233,15 +241,21 @@ def _orthogonal(*rows: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, T
     )
 
 
-def _rotate(a: list[list[Tensor]], v: list[list[Tensor]], p: int, q: int, r: int) -> None:
-    """Zero the entry ``a[p][q]`` of symmetric matrices by one Jacobi rotation, in place."""
+def _rotate(
+    a: list[list[Tensor]],
+    v: list[list[Tensor]],
+    axes: tuple[int, int, int],
+    root: Callable[[Tensor], Tensor],
+) -> None:
+    """Zero the entry of the first two axes of matrices by one Jacobi rotation, in place."""
+    p, q, r = axes
     apq = a[p][q]
     active = apq != 0
     tau = (a[q][q] - a[p][p]) / (2 * torch.where(active, apq, 1.0))
     # tau may overflow to infinity for a negligible apq; then t is correctly 0.
-    t = torch.where(tau >= 0, 1.0, -1.0).to(tau.dtype) / (tau.abs() + (1 + tau * tau).sqrt())
+    t = torch.where(tau >= 0, 1.0, -1.0).to(tau.dtype) / (tau.abs() + root(1 + tau * tau))
     t = torch.where(active, t, 0.0)
-    c = 1 / (1 + t * t).sqrt()
+    c = 1 / root(1 + t * t)
     s = t * c
     a[p][p] = a[p][p] - t * apq
     a[q][q] = a[q][q] + t * apq

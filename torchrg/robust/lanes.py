@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg import kernels
-from torchrg.linalg import eigh3, second_moments
+from torchrg.linalg import second_moments
+from torchrg.linalg.eigen import rounded_eigenvectors3
 from torchrg.robust.scale import median_of_sorted, sort_rows, sum_points
 
 
@@ -70,7 +71,7 @@ def sum_squares(parts: Sequence[Tensor]) -> Tensor:
 def eigenvectors(matrices: Tensor) -> Tensor:
     """Eigenvectors of symmetric ``(*, P, P)``, as columns by ascending eigenvalue."""
     if matrices.shape[-1] == 3:
-        return eigh3(matrices)[1]
+        return rounded_eigenvectors3(matrices)
     vectors: Tensor = torch.linalg.eigh(matrices)[1]
     return vectors
 

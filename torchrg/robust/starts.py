@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchrg import kernels
 from torchrg._parallel import ROWS_IN_CACHE, limit_rows, split_rows
-from torchrg.linalg.precision import machine_epsilon
+from torchrg.linalg.precision import machine_epsilon, rounded_sqrt
 from torchrg.robust.lanes import (
     covariance_entries,
     eigenvectors,
@@ -59,14 +59,16 @@ def _deterministic_starts(columns: list[Tensor], size: int) -> Tensor:
     center, scale = _centers_and_scales(torch.cat(columns, dim=1))
     parts = zip(columns, center.chunk(len(columns)), scale.chunk(len(columns)), strict=True)
     standard = [(column - median) / spread for column, median, spread in parts]
-    loadings = eigenvectors(_scatter_matrices(standard))
+    bounded = [map_values(np.tanh, torch.tanh, column) for column in standard]
+    scores = center.new_tensor(_score_table(len(standard[0])))
     if not is_in_kernels(columns):
-        return _sphered_sets(standard, loadings, size)
-    factor = qn_factor(len(standard[0]))
-    sets, undefined = kernels.call("sphered_sets", *standard, loadings, factor, size)
-    lanes = torch.nonzero(undefined.any(dim=0)).squeeze(1)
+        return _define_sets(standard, bounded, scores, size)
+    sizes = qn_factor(len(standard[0])), size
+    sets, undefined = kernels.call("deterministic_sets", *standard, *bounded, scores, *sizes)
+    lanes = torch.nonzero(undefined).squeeze(1)
     if len(lanes):
-        sets[..., lanes] = _sphered_sets(take_lanes(standard, lanes), loadings[:, lanes], size)
+        parts = (take_lanes(each, lanes) for each in (standard, bounded))
+        sets[..., lanes] = _define_sets(*parts, scores, size)
     return sets
 
 
@@ -114,31 +116,13 @@ def _positive_scale(rows: Tensor, center: Tensor) -> Tensor:
     return scale.index_copy(0, zero, positive)
 
 
-def _scatter_matrices(columns: list[Tensor]) -> Tensor:
+def _scatter_matrices(columns: list[Tensor], bounded: list[Tensor], scores: Tensor) -> Tensor:
     """Stack the six scatter matrices of standardized columns into ``(6, M, P, P)``.
 
     Hyperbolic tangent, Spearman, normal scores, spatial sign, inner half, OGK; in this order.
     """
-    lengths = sum_squares(columns).sqrt()
+    lengths = rounded_sqrt(sum_squares(columns))
     lengths = torch.where(lengths > machine_epsilon(lengths.dtype), lengths, 1.0)
-    bounded = [map_values(np.tanh, torch.tanh, column) for column in columns]
-    scores = lengths.new_tensor(_score_table(len(lengths)))
-    if is_in_kernels(columns):
-        tables, factor = (*columns, *bounded, lengths, scores), qn_factor(len(lengths))
-        (matrices,) = kernels.call("scatter_matrices", *tables, factor)
-        lanes = torch.nonzero(matrices[-1].isnan().flatten(1).any(dim=1)).squeeze(1)
-        if len(lanes):
-            matrices[-1, lanes] = _pairwise_qn(take_lanes(columns, lanes))
-    else:
-        matrices = _covariances(columns, bounded, lengths, scores)
-    matrices[:3] = _correlation(matrices[:3])
-    return matrices
-
-
-def _covariances(
-    columns: list[Tensor], bounded: list[Tensor], lengths: Tensor, scores: Tensor
-) -> Tensor:
-    """Implement :func:`_scatter_matrices`, with covariances in place of the correlations."""
     ranks = [_double_ranks(column) for column in columns]
     half = smallest_points(sum_squares(columns), -(-len(lengths) // 2))
     ones = torch.ones_like(lengths)
@@ -148,23 +132,25 @@ def _covariances(
         return covariance_entries(columns, means, weights, 1.0)
 
     zeros = [torch.zeros_like(lengths[0]) for _ in columns]
-    return torch.stack(
-        [
-            covariance(bounded),
-            covariance([rank.to(lengths.dtype) for rank in ranks]),
-            covariance([torch.take(scores, rank) for rank in ranks]),
-            covariance_entries([column / lengths for column in columns], zeros, ones, 1.0),
-            covariance(columns, half),
-            _pairwise_qn(columns),
-        ]
-    )
+    matrices = [
+        covariance(bounded),
+        covariance([rank.to(lengths.dtype) for rank in ranks]),
+        covariance([torch.take(scores, rank) for rank in ranks]),
+        covariance_entries([column / lengths for column in columns], zeros, ones, 1.0),
+        covariance(columns, half),
+        _pairwise_qn(columns),
+    ]
+    return torch.stack([*map(_correlation, matrices[:3]), *matrices[3:]])
 
 
-def _sphered_sets(columns: list[Tensor], loadings: Tensor, size: int) -> Tensor:
+def _define_sets(
+    columns: list[Tensor], bounded: list[Tensor], scores: Tensor, size: int
+) -> Tensor:
     """Choose the points ``(K, S, M)`` nearest to the center after sphering.
 
-    Points are sphered along eigenvectors ``(S, M, P, P)``.
+    Points are sphered along the eigenvectors of each scatter matrix, by their robust scales.
     """
+    loadings = eigenvectors(_scatter_matrices(columns, bounded, scores))
     axes = [[factor.flatten() for factor in axis.unbind(dim=2)] for axis in loadings.unbind(dim=3)]
     wide = [column.repeat(1, len(loadings)) for column in columns]
     parts = [sum_products(wide, axis) for axis in axes]
@@ -176,7 +162,7 @@ def _sphered_sets(columns: list[Tensor], loadings: Tensor, size: int) -> Tensor:
 
 def _correlation(scatter: Tensor) -> Tensor:
     """Turn covariances ``(*, P, P)`` into correlations; constant columns are uncorrelated."""
-    spread = scatter.diagonal(dim1=-2, dim2=-1).sqrt()
+    spread = rounded_sqrt(scatter.diagonal(dim1=-2, dim2=-1))
     spread = torch.where(spread > 0, spread, 1.0)
     correlation = scatter / (spread[..., :, None] * spread[..., None, :])
     correlation.diagonal(dim1=-2, dim2=-1).fill_(1.0)
