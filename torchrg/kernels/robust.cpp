@@ -9,10 +9,10 @@
 namespace {
 
 constexpr float TYPICAL = 0.42f;       // Qn's difference / length of the shortest half
-constexpr float MARGIN = 0.6f;         // of a window, per difference that a count is off
-constexpr float MIN_MARGIN = 8;        // the same, in differences
+constexpr float MIN_MARGIN = 8;        // differences on each side of a window, and as a fraction of
+constexpr float MARGIN = 0.6f;         // the number by which the nearest limit misses the rank
 constexpr int MAX_DIFFERENCES = 2048;  // in a window
-constexpr int NUM_WINDOWS = 2;          // rounds before all differences are searched
+constexpr int NUM_WINDOWS = 2;         // windows before all differences are searched
 constexpr int FREE_TURNS = 4;          // turns after which a search bisects
 
 // One coordinate of the points of eight patches.
@@ -22,12 +22,13 @@ struct Column {
   INLINE_MEMBER Lanes operator[](int k) const { return load(values + k * LANES); }
   INLINE_MEMBER void set(int k, Lanes lanes) { store(values + k * LANES, lanes); }
   INLINE_MEMBER float& at(int k, int lane) { return values[k * LANES + lane]; }
-  // Whole lanes are stored, which can be loaded at once.
+  // Replaces lanes by those of another column, or by one of its lanes.
   INLINE_MEMBER void replace(Flags lanes, const Column& other, int n) {
     for (int k = 0; k < n; k++) set(k, where(lanes, other[k], (*this)[k]));
   }
   INLINE_MEMBER void replace(Flags lanes, const Column& other, int64_t lane, int n) {
-    for (int k = 0; k < n; k++) set(k, where(lanes, all(other.values[k * LANES + lane]), (*this)[k]));
+    const float* from = other.values + lane;
+    for (int k = 0; k < n; k++) set(k, where(lanes, all(from[k * LANES]), (*this)[k]));
   }
 };
 
@@ -84,6 +85,7 @@ INLINE Lanes roots_of(Lanes squares) {
 }
 
 INLINE Lanes one_where(Flags flags) { return where(flags, all(1), all(0)); }
+
 // Whether a lane is negative, such as true.
 INLINE bool is_any(Flags flags) {
 #ifdef __AVX__
@@ -118,7 +120,8 @@ INLINE void visit_differences(const Column& rows, int n, const Visit& visit) {
   }
 }
 
-SEPARATE static Lanes count_differences(const Column& rows, int n, Lanes pivot) {
+// The number of differences up to a pivot.
+SEPARATE Lanes count_differences(const Column& rows, int n, Lanes pivot) {
   Flags count{};
   visit_differences(rows, n, [&](Lanes difference) {
     const Flags is_within = difference <= pivot;
@@ -129,8 +132,8 @@ SEPARATE static Lanes count_differences(const Column& rows, int n, Lanes pivot) 
 }
 
 struct Around {
-  Flags count;         // differences at most a pivot
-  Lanes below, above;  // the largest of them, and the smallest above
+  Flags count{};                            // differences at most a pivot
+  Lanes below{}, above = Lanes{} + INFINITE;  // the largest of them, and the smallest above
 
   INLINE_MEMBER Flags add(Lanes difference, Lanes pivot) {
     const Flags is_within = difference <= pivot;
@@ -163,14 +166,17 @@ struct Window {
   }
 
   SEPARATE Around look_around(const Column& rows, int n, Lanes pivot) const {
-    Around around{size < 0 ? Flags{} : below, Lanes{}, all(INFINITE)}, other{Flags{}, Lanes{}, all(INFINITE)};
+    Around around, other;
+    if (size < 0)
+      visit_differences(rows, n, [&](Lanes difference) { return around.add(difference, pivot); });
+    else
+      around.count = below;
     for (int i = 0; i < size; i += 2) {
       around.add(load(values + i * LANES), pivot);
       other.add(load(values + (i + 1) * LANES), pivot);
     }
-    around = {around.count + other.count, larger(around.below, other.below), smaller(around.above, other.above)};
-    if (size < 0)
-      visit_differences(rows, n, [&](Lanes difference) { return around.add(difference, pivot); });
+    around.count += other.count, around.below = larger(around.below, other.below);
+    around.above = smaller(around.above, other.above);
     return around;
   }
 };
@@ -254,7 +260,7 @@ struct Matrix {
 };
 
 // Weighted second moments about the mean or zero.
-SEPARATE static Matrix find_moments(const Points& points, const Column& weights, int n,
+SEPARATE Matrix find_moments(const Points& points, const Column& weights, int n,
                                     bool is_centered) {
   Matrix found;
   Lanes center[3], count{};
@@ -287,7 +293,7 @@ INLINE void correlate(Matrix& matrix) {
 }
 
 // eigen.eigh3: unit eigenvectors as columns by ascending eigenvalue; false where one is infinite.
-SEPARATE static Flags decompose(Matrix& matrix, Lanes (&vectors)[3][3]) {
+SEPARATE Flags decompose(Matrix& matrix, Lanes (&vectors)[3][3]) {
   constexpr int SWEEPS = 5;
   Lanes scale{}, zero{};
   for (const Lanes entry : matrix.entries)
@@ -459,7 +465,7 @@ KERNEL smallest_points(int64_t n, int64_t M, Floats values, int64_t size, float*
   return DONE;
 }
 
-// starts._define_sets: the six deterministic starts, and where the definition must find them, since
+// starts._sphered_sets: the six deterministic starts, and where the definition must find them, since
 // a scale is zero or a number infinite.
 KERNEL deterministic_sets(int64_t num_points, int64_t M, int64_t T, Floats x, Floats y, Floats z,
                           Floats tx, Floats ty, Floats tz, Floats scores, double factor,
@@ -560,7 +566,8 @@ KERNEL concentrate(int64_t n, int64_t M, int64_t S, Floats x, Floats y, Floats z
       if (job.start == 0) load_points(x, y, z, int(n), first, M, around);
       load_column(initial + job.start * M, int(n), first, M, starts, S);
     }
-    job.patch = first + lane, active++, floors[l] = floor[job.patch], sizes[l] = float(initial_size);
+    job.patch = first + lane, active++;
+    floors[l] = floor[job.patch], sizes[l] = float(initial_size);
     int32_t flags[LANES] = {};
     flags[l] = -1;
     for (int i = 0; i < 3; i++)

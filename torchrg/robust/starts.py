@@ -59,16 +59,13 @@ def _deterministic_starts(columns: list[Tensor], size: int) -> Tensor:
     center, scale = _centers_and_scales(torch.cat(columns, dim=1))
     parts = zip(columns, center.chunk(len(columns)), scale.chunk(len(columns)), strict=True)
     standard = [(column - median) / spread for column, median, spread in parts]
-    bounded = [map_values(np.tanh, torch.tanh, column) for column in standard]
-    scores = center.new_tensor(_score_table(len(standard[0])))
     if not is_in_kernels(columns):
-        return _define_sets(standard, bounded, scores, size)
-    sizes = qn_factor(len(standard[0])), size
-    sets, undefined = kernels.call("deterministic_sets", *standard, *bounded, scores, *sizes)
+        return _sphered_sets(standard, size)
+    tables, factor = (*_bounded(standard), _scores(standard)), qn_factor(len(standard[0]))
+    sets, undefined = kernels.call("deterministic_sets", *standard, *tables, factor, size)
     lanes = torch.nonzero(undefined).squeeze(1)
     if len(lanes):
-        parts = (take_lanes(each, lanes) for each in (standard, bounded))
-        sets[..., lanes] = _define_sets(*parts, scores, size)
+        sets[..., lanes] = _sphered_sets(take_lanes(standard, lanes), size)
     return sets
 
 
@@ -116,14 +113,14 @@ def _positive_scale(rows: Tensor, center: Tensor) -> Tensor:
     return scale.index_copy(0, zero, positive)
 
 
-def _scatter_matrices(columns: list[Tensor], bounded: list[Tensor], scores: Tensor) -> Tensor:
+def _scatter_matrices(columns: list[Tensor]) -> Tensor:
     """Stack the six scatter matrices of standardized columns into ``(6, M, P, P)``.
 
     Hyperbolic tangent, Spearman, normal scores, spatial sign, inner half, OGK; in this order.
     """
     lengths = rounded_sqrt(sum_squares(columns))
     lengths = torch.where(lengths > machine_epsilon(lengths.dtype), lengths, 1.0)
-    ranks = [_double_ranks(column) for column in columns]
+    ranks, scores = [_double_ranks(column) for column in columns], _scores(columns)
     half = smallest_points(sum_squares(columns), -(-len(lengths) // 2))
     ones = torch.ones_like(lengths)
 
@@ -133,7 +130,7 @@ def _scatter_matrices(columns: list[Tensor], bounded: list[Tensor], scores: Tens
 
     zeros = [torch.zeros_like(lengths[0]) for _ in columns]
     matrices = [
-        covariance(bounded),
+        covariance(_bounded(columns)),
         covariance([rank.to(lengths.dtype) for rank in ranks]),
         covariance([torch.take(scores, rank) for rank in ranks]),
         covariance_entries([column / lengths for column in columns], zeros, ones, 1.0),
@@ -143,14 +140,12 @@ def _scatter_matrices(columns: list[Tensor], bounded: list[Tensor], scores: Tens
     return torch.stack([*map(_correlation, matrices[:3]), *matrices[3:]])
 
 
-def _define_sets(
-    columns: list[Tensor], bounded: list[Tensor], scores: Tensor, size: int
-) -> Tensor:
+def _sphered_sets(columns: list[Tensor], size: int) -> Tensor:
     """Choose the points ``(K, S, M)`` nearest to the center after sphering.
 
-    Points are sphered along the eigenvectors of each scatter matrix, by their robust scales.
+    Points are sphered along the eigenvectors of each scatter matrix.
     """
-    loadings = eigenvectors(_scatter_matrices(columns, bounded, scores))
+    loadings = eigenvectors(_scatter_matrices(columns))
     axes = [[factor.flatten() for factor in axis.unbind(dim=2)] for axis in loadings.unbind(dim=3)]
     wide = [column.repeat(1, len(loadings)) for column in columns]
     parts = [sum_products(wide, axis) for axis in axes]
@@ -158,6 +153,11 @@ def _define_sets(
     sphered = [sum_products(parts, column) for column in zip(*axes, strict=True)]
     distances = sum_squares([values - median_points(values) for values in sphered])
     return smallest_points(distances, size).view(len(distances), *loadings.shape[:2])
+
+
+def _bounded(columns: list[Tensor]) -> list[Tensor]:
+    """Return the hyperbolic tangent of each coordinate."""
+    return [map_values(np.tanh, torch.tanh, column) for column in columns]
 
 
 def _correlation(scatter: Tensor) -> Tensor:
@@ -200,6 +200,11 @@ def _score_table(count: int) -> tuple[float, ...]:
         for double in range(1, 2 * count + 1)
     ]
     return (scores[0], *scores)
+
+
+def _scores(columns: list[Tensor]) -> Tensor:
+    """Return the table of normal scores for the points of columns ``(K, M)``."""
+    return columns[0].new_tensor(_score_table(len(columns[0])))
 
 
 def _plane_starts(columns: list[Tensor], size: int) -> Tensor:
