@@ -38,7 +38,6 @@ class SharedNeighbors:
     def __init__(self, neighbors: Neighbors, min_shared: int) -> None:
         self._neighbors = neighbors
         self._min_shared = min_shared
-        self._buffers: list[Tensor] = []
 
     def connected(self, rows: slice, candidates: Tensor) -> Tensor:
         """Return a mask of the block's edges that join connected points, eq. (10).
@@ -49,14 +48,9 @@ class SharedNeighbors:
         if self._min_shared <= 0:
             return candidates.clone()
         if kernels.serve(*self._neighbors, candidates, k=candidates.shape[1]):
-            try:
-                column_of = self._buffers.pop()
-            except IndexError:
-                column_of = torch.zeros(len(self._neighbors.indices), dtype=torch.int32)
-            edges = *self._neighbors, candidates, column_of, rows.start, self._min_shared
-            (joined,) = kernels.call("connected", *edges)
-            self._buffers.append(column_of)
-            return joined
+            numbers = torch.empty_like(self._neighbors.indices[:, 0])
+            edges = *self._neighbors, candidates, numbers, rows.start, self._min_shared
+            return kernels.call("connected", *edges)[0]
         size = _BLOCK_SIZE if candidates.device.type == "cpu" else _DEVICE_BLOCK_SIZE
 
         def count(block: slice) -> Tensor:
