@@ -1,6 +1,6 @@
-// Inner loops of consensus normals: each neighborhood stays in the cache for all of its steps.
-// See torchrg/normals/consensus/ for definitions, and torchrg/normals/jet.py for paraboloids.
-#include "plain.h"
+// Inner loops of consensus normals: eight neighborhoods, one per lane, stay in the cache for all of
+// their steps. See torchrg/normals/consensus/ for definitions.
+#include "patches.h"
 
 namespace {
 
@@ -10,222 +10,272 @@ struct Constants {
   float num_refits, num_alternations, minimum;
 };
 
-struct Meeting {
-  Plane plane;
-  float deviation;
+// Ranks of the neighbors that span candidates, two per candidate.
+struct Pairs {
+  const int64_t* ranks;
+  int64_t num;
 };
 
-INLINE float sum(const float* values, int width) {
-  Lanes lanes{};
-  for (int j = 0; j < width; j += LANES) lanes += load(values + j);
-  return total(lanes);
+struct Meeting {
+  Planes planes;
+  Lanes deviation;
+};
+INLINE Meeting choose(Flags flags, const Meeting& a, const Meeting& b) {
+  return {where(flags, a.planes, b.planes), where(flags, a.deviation, b.deviation)};
 }
 
-INLINE float product(const float* a, const float* b, int width) {
-  Lanes lanes{};
-  for (int j = 0; j < width; j += LANES) lanes += load(a + j) * load(b + j);
-  return total(lanes);
+INLINE Lanes sum(const Column& values, int width) {
+  Lanes sums{};  // of 0 and 1, in any order
+  for (int j = 0; j < width; j++) sums += values[j];
+  return sums;
 }
 
-INLINE void residuals(const Patch& patch, const Plane& plane, float* distances) {
-  for (int j = 0; j < patch.width; j += LANES) store(distances + j, plane.residuals(patch, j));
-}
+INLINE Lanes side(Lanes sum) { return where(sum >= 0, all(1), all(-1)); }
 
 // hypotheses._refit
-INLINE void refit(const Patch& patch, const float* weights, float reach, bool bisquare,
-                  Plane& plane) {
-  alignas(32) float voted_weights[MAX_WIDTH];
-  for (int j = 0; j < patch.width; j += LANES) {
-    const Lanes residual = plane.residuals(patch, j) / reach;
+void refit(const Patch& patch, const Column& weights, Lanes reach, bool bisquare, Planes& planes) {
+  static thread_local Column storage;
+  Column& voted_weights = storage;
+  for (int j = 0; j < patch.width; j++) {
+    const Lanes residual = planes.residuals(patch, j) / reach;
     Lanes near = positive(1 - residual * residual);
     if (bisquare) near *= near;
-    store(voted_weights + j, load(weights + j) * near);
+    voted_weights.set(j, weights[j] * near);
   }
-  const Plane fitted = fit_plane(patch, voted_weights, patch.width);
-  if (float(fitted.middle) > 1e-6f * float(fitted.high)) plane = fitted;
+  const Planes fitted = fit_planes(patch, voted_weights, patch.width);
+  planes = where(fitted.middle > 1e-6f * fitted.high, fitted, planes);
 }
 
 // hypotheses.vote_planes
-Plane vote(const Patch& patch, const float* counted, float noise, const float* start,
-           const int64_t* ranks, int64_t num_pairs, const Constants& constants) {
-  alignas(32) float weights[MAX_WIDTH], nearness[MAX_WIDTH];
-  const float maximum = farthest(patch, counted), far = maximum > 0 ? maximum : 1;
-  for (int j = 0; j < patch.width; j += LANES) {
-    const Lanes near = patch.sq_lengths(j) / far;
-    store(nearness + j, near);
-    store(weights + j, (1 - constants.vote_falloff * near) * load(counted + j));
-  }
-  const float reach = constants.vote_reach * noise;
-  Plane plane = {start[0], start[1], start[2], 0, 0, 0, 0};
-  float best = support(patch, weights, plane.a / reach, plane.b / reach, plane.c / reach, 0);
-  for (int64_t pair = 0; pair < num_pairs; pair++) {
-    const int64_t p = ranks[2 * pair], q = ranks[2 * pair + 1];
-    float a = patch.y[p] * patch.z[q] - patch.z[p] * patch.y[q];
-    float b = patch.z[p] * patch.x[q] - patch.x[p] * patch.z[q];
-    float c = patch.x[p] * patch.y[q] - patch.y[p] * patch.x[q];
-    const float sq_area = a * a + b * b + c * c;
-    if (!(sq_area > 0)) continue;
-    const float length = square_root(sq_area);
-    a /= length, b /= length, c /= length;
-    const float score = support(patch, weights, a / reach, b / reach, c / reach, 0);
-    if (score > best) best = score, plane.a = a, plane.b = b, plane.c = c;
-  }
-  for (int i = 0; i < constants.num_refits; i++) refit(patch, weights, reach, false, plane);
-  for (int j = 0; j < patch.width; j += LANES)
-    store(weights + j, (1 - constants.fit_falloff * load(nearness + j)) * load(counted + j));
-  for (int i = 0; i < constants.num_refits; i++)
-    refit(patch, weights, constants.fit_reach * noise, true, plane);
-  return plane;
-}
-
-// hypotheses._off_surface: weights of the points off a surface, on its more populated side.
-INLINE void beyond(const Patch& patch, const float* distances, float gap, float* flags) {
-  Lanes over{}, under{};
-  for (int j = 0; j < patch.width; j += LANES) {
-    over += where(load(distances + j) > gap, load(patch.weight + j), all(0));
-    under += where(load(distances + j) < -gap, load(patch.weight + j), all(0));
-  }
-  const float sign = total(under) <= total(over) ? 1 : -1;
-  for (int j = 0; j < patch.width; j += LANES)
-    store(flags + j, where(load(distances + j) * sign > gap, load(patch.weight + j), all(0)));
-}
-
-INLINE void near(const Patch& patch, const float* distances, float gap, const float* counted,
-                 float* flags) {
-  for (int j = 0; j < patch.width; j += LANES)
-    store(flags + j, where(magnitude(load(distances + j)) <= gap, load(counted + j), all(0)));
-}
-
-INLINE float side(float sum) { return sum >= 0 ? 1 : -1; }
-
-// hypotheses.fit_wedges, or fit_corners if there is a third group of points. Alternates between
-// planes and their points; returns the points of each plane and signed distances to the surface.
-Meeting alternate(const Patch& patch, int count, float* first, float* second, float* third,
-                  float* outer, const Constants& constants) {
-  alignas(32) float r[MAX_WIDTH], s[MAX_WIDTH], t[MAX_WIDTH];
-  const int width = patch.width;
-  bool present = true;
-  float cuts = 0;
-  Plane one, other, last;
-  for (int turn = 0; turn <= constants.num_alternations; turn++) {
-    const float fewest = smaller(sum(first, width), sum(second, width));
-    present &= (third ? smaller(fewest, sum(third, width)) : fewest) >= constants.minimum;
-    if (turn == constants.num_alternations) break;
-    one = fit_plane(patch, first, width), other = fit_plane(patch, second, width);
-    residuals(patch, one, r), residuals(patch, other, s);
-    const float u = side(product(r, second, width)), v = side(product(s, first, width));
-    for (int j = 0; j < width; j += LANES) {
-      const Lanes e = load(r + j) * u, f = load(s + j) * v, weight = load(patch.weight + j);
-      store(r + j, where(f > e, weight, all(0))), store(outer + j, smaller(e, f));
-    }
-    if (third) {
-      last = fit_plane(patch, third, width), residuals(patch, last, t);
-      for (int j = 0; j < width; j += LANES) store(first + j, load(first + j) + load(second + j));
-      const float w = side(product(t, first, width));
-      if (cuts == 0) cuts = side(product(outer, third, width));
-      for (int j = 0; j < width; j += LANES) {
-        const Lanes pair = load(outer + j) * cuts, added = load(t + j) * w;
-        store(outer + j, smaller(added, pair) * cuts);
-        store(third + j, where(pair > added, load(patch.weight + j), all(0)));
-      }
-    }
-    for (int j = 0; j < width; j += LANES) {
-      const Lanes weight = load(patch.weight + j);
-      const Lanes left = weight - (third ? load(third + j) : all(0));
-      store(outer + j, load(outer + j) * weight);
-      store(first + j, load(r + j) * left), store(second + j, left - load(first + j));
-    }
-  }
-  const float freedom = count - (third ? 9 : 6), squares = product(outer, outer, width);
-  const Plane& result = third && third[0] > 0 ? last : second[0] > 0 ? other : one;
-  return {result, present ? square_root(squares / larger(freedom, 1.0f)) : INFINITE};
-}
-
-// hypotheses.fit_meeting_planes
-Meeting meet(const Patch& patch, const Plane& voted, float noise, int count, const int64_t* ranks,
-             int64_t num_pairs, const Constants& constants) {
-  alignas(32) float first[MAX_WIDTH], second[MAX_WIDTH], third[MAX_WIDTH];
-  alignas(32) float outer[MAX_WIDTH], remaining[MAX_WIDTH];
-  const int width = patch.width;
-  const float gap = constants.gap * noise;
-  residuals(patch, voted, remaining);
-  near(patch, remaining, gap, patch.weight, first), beyond(patch, remaining, gap, second);
-  const Meeting best = alternate(patch, count, first, second, nullptr, outer, constants);
-  if (!(best.deviation > constants.corner_limit * noise)) return best;
-  const float minimum = constants.corner_fraction * best.deviation;
-  // Three planes: start from the two and the points off them.
-  beyond(patch, outer, gap, third);
-  for (int j = 0; j < width; j += LANES) {
-    const Lanes on = 1 - load(third + j), is_first = load(first + j);
-    store(second + j, (load(patch.weight + j) - is_first) * on), store(first + j, is_first * on);
-  }
-  const Meeting by_two = alternate(patch, count, first, second, third, outer, constants);
-  // Three planes: start from the voted plane and the plane voted by the remaining points.
-  residuals(patch, voted, outer);
-  near(patch, outer, gap, patch.weight, first);
-  int anchor = 0;
-  for (int j = 0; j < width; j++) remaining[j] = patch.weight[j] - first[j];
-  while (anchor < width && remaining[anchor] == 0) anchor++;
-  if (anchor == width) anchor = 0;
-  Patch moved = patch;
-  for (int j = 0; j < width; j++) {
-    moved.x[j] -= patch.x[anchor], moved.y[j] -= patch.y[anchor], moved.z[j] -= patch.z[anchor];
-    if (patch.weight[j] == 0) moved.x[j] = moved.y[j] = moved.z[j] = 0;
-  }
-  const Plane start = fit_plane(moved, remaining, width);
-  const float normal[3] = {start.a, start.b, start.c};
-  const Plane other = vote(moved, remaining, noise, normal, ranks, num_pairs, constants);
-  residuals(moved, other, outer);
-  near(moved, outer, gap, remaining, second);
-  for (int j = 0; j < width; j++) third[j] = remaining[j] - second[j];
-  const Meeting by_votes = alternate(patch, count, first, second, third, outer, constants);
-  Meeting three = by_two.deviation < minimum ? by_two : Meeting{best.plane, minimum};
-  if (by_votes.deviation < three.deviation) three = by_votes;
-  return three.deviation < minimum ? three : best;
-}
-
-// Compacts the points of nonzero weight to the front; returns their number.
-INLINE int compact(Patch& patch) {
-  int count = 0;
+Planes vote(const Patch& patch, const Column& counted, Lanes noise, const Planes& start,
+            const Pairs& pairs, const Constants& constants) {
+  static thread_local Column storage[2];
+  Column &weights = storage[0], &nearness = storage[1];
+  const Lanes maximum = farthest(patch, counted), far = where(maximum > 0, maximum, all(1));
   for (int j = 0; j < patch.width; j++) {
-    if (patch.weight[j] == 0) continue;
-    patch.x[count] = patch.x[j], patch.y[count] = patch.y[j], patch.z[count] = patch.z[j];
-    patch.weight[count++] = 1;
+    const Lanes near = patch.sq_lengths(j) / far;
+    nearness.set(j, near), weights.set(j, (1 - constants.vote_falloff * near) * counted[j]);
   }
-  for (int j = count; j < patch.width; j++)
-    patch.x[j] = patch.y[j] = patch.z[j] = patch.weight[j] = 0;
-  patch.width = padded(larger(count, 1));
-  return count;
+  const Lanes reach = constants.vote_reach * noise;
+  Planes planes = {start.a, start.b, start.c};
+  Lanes best = support(patch, weights, start.a / reach, start.b / reach, start.c / reach, Lanes{});
+  for (int64_t pair = 0; pair < pairs.num; pair++) {
+    const int p = int(pairs.ranks[2 * pair]), q = int(pairs.ranks[2 * pair + 1]);
+    Lanes a = patch.y[p] * patch.z[q] - patch.z[p] * patch.y[q];
+    Lanes b = patch.z[p] * patch.x[q] - patch.x[p] * patch.z[q];
+    Lanes c = patch.x[p] * patch.y[q] - patch.y[p] * patch.x[q];
+    const Lanes sq_area = a * a + b * b + c * c, length = roots_of(sq_area);
+    a /= length, b /= length, c /= length;
+    const Lanes score = support(patch, weights, a / reach, b / reach, c / reach, Lanes{});
+    const Flags is_better = (sq_area > 0) & (score > best);
+    best = where(is_better, score, best);
+    planes = where(is_better, Planes{a, b, c}, planes);
+  }
+  for (int i = 0; i < constants.num_refits; i++) refit(patch, weights, reach, false, planes);
+  for (int j = 0; j < patch.width; j++)
+    weights.set(j, (1 - constants.fit_falloff * nearness[j]) * counted[j]);
+  for (int i = 0; i < constants.num_refits; i++)
+    refit(patch, weights, constants.fit_reach * noise, true, planes);
+  return planes;
+}
+
+// hypotheses._off_surface: the points off a surface, on its more populated side.
+INLINE void beyond(const Column& distances, int width, Lanes gap, Column& flags) {
+  Lanes over{}, under{};
+  for (int j = 0; j < width; j++) {
+    over += one_where(distances[j] > gap);
+    under += one_where(distances[j] < -gap);
+  }
+  const Lanes sign = where(under <= over, all(1), all(-1));
+  for (int j = 0; j < width; j++) flags.set(j, one_where(distances[j] * sign > gap));
+}
+
+INLINE Lanes near(const Planes& planes, const Patch& patch, int j, Lanes gap) {
+  return one_where(magnitude(planes.residuals(patch, j)) <= gap);
+}
+
+// hypotheses.fit_wedges, or fit_corners with a third group of points. Alternates between planes and
+// their points; returns the points of each plane and signed distances to the surface.
+template <bool is_corner>
+Meeting alternate(const Patch& patch, Column& first, Column& second, Column& third, Column& outer,
+                  const Constants& constants) {
+  static thread_local Column storage[3];
+  Column &r = storage[0], &s = storage[1], &t = storage[2];
+  const int width = patch.width;
+  Flags present = ~Flags{};
+  Lanes cuts{};
+  Planes one, other, last;
+  const auto check = [&](Lanes a, Lanes b, Lanes c) {
+    const Lanes fewest = is_corner ? smaller(smaller(a, b), c) : smaller(a, b);
+    present = present & (fewest >= constants.minimum);
+  };
+  for (int turn = 0; turn < constants.num_alternations; turn++) {
+    one = fit_planes(patch, first, width), other = fit_planes(patch, second, width);
+    if (is_corner) last = fit_planes(patch, third, width);
+    check(one.count, other.count, last.count);
+    const Sums<3> inside = add_up<3>(width, [&](int j, Lanes* sums) {
+      const Lanes e = one.residuals(patch, j), f = other.residuals(patch, j);
+      r.set(j, e), s.set(j, f), sums[0] += e * second[j], sums[1] += f * first[j];
+      if (!is_corner) return;
+      const Lanes g = last.residuals(patch, j);
+      t.set(j, g), sums[2] += g * (first[j] + second[j]);
+    });
+    const Lanes u = side(inside[0]), v = side(inside[1]), w = side(inside[2]);
+    if (is_corner && turn == 0) {
+      const Sums<1> cut = add_up<1>(
+          width, [&](int j, Lanes* sums) { *sums += smaller(r[j] * u, s[j] * v) * third[j]; });
+      cuts = side(cut[0]);
+    }
+    Flags same = ~Flags{};
+    for (int j = 0; j < width; j++) {
+      const Lanes e = r[j] * u, f = s[j] * v;
+      Lanes of_first = one_where(f > e), distance = smaller(e, f), left = all(1);
+      if (is_corner) {
+        const Lanes pair = distance * cuts, added = t[j] * w, of_third = one_where(pair > added);
+        distance = smaller(added, pair) * cuts, left -= of_third, of_first *= left;
+        third.set(j, of_third);
+      }
+      const Lanes of_second = left - of_first;
+      same = same & (of_first == first[j]) & (of_second == second[j]);
+      outer.set(j, distance), first.set(j, of_first), second.set(j, of_second);
+    }
+    if (!is_any(~same)) break;  // the next turn would repeat this one
+  }
+  check(sum(first, width), sum(second, width), sum(third, width));
+  const Sums<1> squares =
+      add_up<1>(width, [&](int j, Lanes* sums) { *sums += outer[j] * outer[j]; });
+  const float freedom = larger(float(width - (is_corner ? 9 : 6)), 1.0f);
+  const Planes of_two = where(second[0] > 0, other, one);
+  return {is_corner ? where(third[0] > 0, last, of_two) : of_two,
+          where(present, roots_of(squares[0] / freedom), all(INFINITE))};
+}
+
+// Neighborhoods that two planes do not explain, their points of the first plane, and their signed
+// distances to both.
+struct Corners {
+  Patch patch;
+  Column first, outer;
+  Rows rows;
+};
+
+// hypotheses.fit_meeting_planes: the best of two and of three planes.
+Meeting meet(Corners& corners, const Planes& voted, const Meeting& best, Lanes noise,
+             const Pairs& pairs, const Constants& constants) {
+  static thread_local Patch moved_storage;
+  static thread_local Column storage[3];
+  const Patch& patch = corners.patch;
+  Patch& moved = moved_storage;
+  Column &first = corners.first, &outer = corners.outer;
+  Column &second = storage[0], &third = storage[1], &remaining = storage[2];
+  const int width = moved.width = patch.width;
+  const Lanes gap = constants.gap * noise, minimum = constants.corner_fraction * best.deviation;
+  // Start from the two planes and the points off them.
+  beyond(outer, width, gap, third);
+  for (int j = 0; j < width; j++) {
+    const Lanes on = 1 - third[j], is_first = first[j];
+    second.set(j, (1 - is_first) * on), first.set(j, is_first * on);
+  }
+  const Meeting by_two = alternate<true>(patch, first, second, third, outer, constants);
+  // Start from the voted plane and the plane voted by the remaining points.
+  Lanes x = patch.x[0], y = patch.y[0], z = patch.z[0];
+  for (int j = width - 1; j >= 0; j--) {
+    const Lanes is_near = near(voted, patch, j, gap);
+    const Flags is_left = is_near < 1;
+    first.set(j, is_near), remaining.set(j, 1 - is_near);
+    x = where(is_left, patch.x[j], x), y = where(is_left, patch.y[j], y);
+    z = where(is_left, patch.z[j], z);
+  }
+  for (int j = 0; j < width; j++)
+    moved.x.set(j, patch.x[j] - x), moved.y.set(j, patch.y[j] - y), moved.z.set(j, patch.z[j] - z);
+  const Planes start = fit_planes(moved, remaining, width);
+  const Planes other = vote(moved, remaining, noise, start, pairs, constants);
+  for (int j = 0; j < width; j++) {
+    const Lanes is_near = near(other, moved, j, gap) * remaining[j];
+    second.set(j, is_near), third.set(j, remaining[j] - is_near);
+  }
+  const Meeting by_votes = alternate<true>(patch, first, second, third, outer, constants);
+  Meeting three = choose(by_two.deviation < minimum, by_two, Meeting{best.planes, minimum});
+  three = choose(by_votes.deviation < three.deviation, by_votes, three);
+  return choose(three.deviation < minimum, three, best);
+}
+
+// Moves the counted points of neighborhoods to the front; false if their numbers differ.
+bool compact(Patch& patch) {
+  int count = 0;
+  for (int lane = 0; lane < LANES; lane++) {
+    int end = 0;
+    for (int j = 0; j < patch.width; j++) {
+      if (patch.weight.at(j, lane) == 0) continue;
+      patch.x.at(end, lane) = patch.x.at(j, lane), patch.y.at(end, lane) = patch.y.at(j, lane);
+      patch.z.at(end, lane) = patch.z.at(j, lane), patch.weight.at(end++, lane) = 1;
+    }
+    if (lane == 0) count = end;
+    if (end != count) return false;
+  }
+  patch.width = count;
+  return true;
 }
 
 }  // namespace
 
 // surfaces.broken_planes: the voted plane, and the best of two or three intersecting planes.
-// `pairs` are ranks of candidates for `k` counted neighbors.
+// `pairs` are ranks of candidates among the counted neighbors, of equal number in all rows.
 KERNEL broken_planes(int64_t num_points, int64_t num_rows, int64_t k, int64_t num_pairs,
                      int64_t num_constants, Floats points, Ints indices, Flagged mask, Floats noise,
                      Floats normals, Longs pairs, Floats numbers, float* voted,
                      float* voted_offsets, float* meeting, float* meeting_offsets,
                      float* deviations) {
+  static thread_local Corners storage;
+  static thread_local Column columns[3];
   if (4 * num_constants != sizeof(Constants)) return TOO_WIDE;
   Constants constants;
   __builtin_memcpy(&constants, numbers, sizeof constants);
   const float turns = constants.num_alternations;
   if (!(turns >= 1 && turns < MAX_WIDTH && constants.num_refits < MAX_WIDTH)) return TOO_WIDE;
   const Lists lists = {num_points, num_rows, k, points, indices, mask};
+  const Pairs candidates = {pairs, num_pairs};
+  Corners& corners = storage;
+  Column &first = columns[0], &second = columns[1], &outer = columns[2];
+  const auto write = [&](const Rows& rows, const Meeting& found) {
+    found.planes.write(rows, meeting, meeting_offsets), rows.write(found.deviation, deviations);
+  };
+  const auto finish = [&] {
+    Rows& rows = corners.rows;
+    const Planes by_votes = planes_of(rows, voted, voted_offsets);
+    const Meeting two = {planes_of(rows, meeting, meeting_offsets), rows.of(deviations)};
+    write(rows, meet(corners, by_votes, two, rows.of(noise), candidates, constants));
+    rows.used = 0;
+  };
+  corners.rows.used = 0;
   bool inside = true;
   const int64_t status =
-      visit_patches(lists, nullptr, num_rows, [&](int64_t, int64_t i, Patch& patch) {
-        const int count = compact(patch);
+      visit_patches(lists, nullptr, num_rows, [&](const Rows& rows, Patch& patch) {
+        if (mask) inside &= compact(patch);
         for (int64_t rank = 0; rank < 2 * num_pairs; rank++)
-          inside &= pairs[rank] >= 0 && pairs[rank] < count;
+          inside &= pairs[rank] >= 0 && pairs[rank] < patch.width;
         if (!inside) return;
-        const Plane plane =
-            vote(patch, patch.weight, noise[i], normals + 3 * i, pairs, num_pairs, constants);
-        const Meeting found = meet(patch, plane, noise[i], count, pairs, num_pairs, constants);
-        write(plane, voted, i), write(found.plane, meeting, i);
-        voted_offsets[i] = plane.offset, meeting_offsets[i] = found.plane.offset;
-        deviations[i] = found.deviation;
+        const int width = corners.patch.width = patch.width;
+        const Lanes scale = rows.of(noise), gap = constants.gap * scale;
+        const Planes start = planes_of(rows, normals);
+        const Planes planes = vote(patch, patch.weight, scale, start, candidates, constants);
+        for (int j = 0; j < width; j++) {
+          outer.set(j, planes.residuals(patch, j)), first.set(j, near(planes, patch, j, gap));
+        }
+        beyond(outer, width, gap, second);
+        const Meeting two = alternate<false>(patch, first, second, second, outer, constants);
+        planes.write(rows, voted, voted_offsets), write(rows, two);
+        const Flags fails = two.deviation > constants.corner_limit * scale;
+        for (int lane = 0; lane < rows.used; lane++) {
+          if (!fails[lane]) continue;
+          const int to = corners.rows.used;
+          const auto copy = [&](const Column& column, Column& copied) {
+            for (int j = 0; j < width; j++) copied.at(j, to) = column.at(j, lane);
+          };
+          copy(patch.x, corners.patch.x), copy(patch.y, corners.patch.y);
+          copy(patch.z, corners.patch.z), copy(first, corners.first), copy(outer, corners.outer);
+          if (corners.rows.add(rows.numbers[lane])) finish();
+        }
       });
+  if (corners.rows.used > 0) finish();
   return inside ? status : int64_t(NO_SUCH_ROW);
 }

@@ -1,5 +1,5 @@
 // Least-squares planes of neighborhoods (torchrg/normals/pca.py) and their noise.
-#include "plain.h"
+#include "patches.h"
 
 // torchrg.normals.pca.fit_normals_pca. Patches as narrow as the rounding of their covariance are
 // flagged and recomputed by the torch definition.
@@ -8,62 +8,58 @@ KERNEL fit_normals_pca(int64_t num_points, int64_t num_rows, int64_t k, Floats p
                        float* normals, float* curvature, float* residual_rms, bool* valid,
                        bool* narrow) {
   const Lists lists = {num_points, num_rows, k, points, indices, mask};
-  return visit_patches(lists, nullptr, num_rows, [&](int64_t, int64_t i, const Patch& patch) {
-    float mean[3], covariance[6];
-    moments(patch, patch.weight, patch.width, mean, covariance);
-    Plane plane;
-    decompose(covariance, plane);
-    const float sum = covariance[0] + covariance[3] + covariance[5], low = float(plane.low);
-    const float length = square_root(float(plane.high)), width = square_root(float(plane.middle));
-    narrow[i] = !(width >= float(narrow_fraction) * length);
-    valid[i] = width > larger(float(tolerance) * length, resolution[i]);
-    write(valid[i] ? plane : Plane{}, normals, i);
-    curvature[i] = valid[i] ? smaller(low / (sum > 0 ? sum : 1), 1 / 3.0f) : 0;
-    residual_rms[i] = valid[i] ? square_root(low) : 0;
+  return visit_patches(lists, nullptr, num_rows, [&](const Rows& rows, const Patch& patch) {
+    const Moments found = moments(patch, patch.weight, patch.width);
+    Planes planes = decompose(found.covariance);
+    const Lanes sum = found.covariance[0] + found.covariance[3] + found.covariance[5];
+    const Lanes length = roots_of(planes.high), width = roots_of(planes.middle);
+    const Flags is_wide = width >= float(narrow_fraction) * length;
+    const Flags is_valid = width > larger(float(tolerance) * length, rows.of(resolution));
+    planes = where(is_valid, planes, Planes{});
+    planes.write(rows, normals);
+    const Lanes fraction = planes.low / where(sum > 0, sum, all(1));
+    rows.write(where(is_valid, smaller(fraction, all(1 / 3.0f)), all(0)), curvature);
+    rows.write(roots_of(planes.low), residual_rms);
+    for (int l = 0; l < rows.used; l++)
+      narrow[rows.positions[l]] = !is_wide[l], valid[rows.positions[l]] = is_valid[l];
   });
 }
 
 namespace {
 
 // torchrg.normals.consensus.noise._small_deviations: RMS residual of the first neighbors.
-INLINE float of_few(const Patch& patch, int count, float breadth) {
-  alignas(32) float weights[MAX_WIDTH], inside[MAX_WIDTH];
-  const int width = padded(count);
-  for (int j = 0; j < width; j++) inside[j] = j < count, weights[j] = inside[j] * patch.weight[j];
-  if (weights[count - 1] == 0) return INFINITE;
-  const Plane plane = fit_plane(patch, weights, width);
-  if (!(float(plane.middle) > breadth * float(plane.high))) return INFINITE;
-  Lanes squares{};
-  for (int j = 0; j < width; j += LANES) {
-    const Lanes residual = plane.residuals(patch, j);
-    squares += residual * residual * load(inside + j);
-  }
-  return square_root(total(squares) / float(count - 3));
+INLINE Lanes of_few(const Patch& patch, int count, float breadth) {
+  const Planes planes = fit_planes(patch, patch.weight, count);
+  const Sums<1> squares = add_up<1>(count, [&](int j, Lanes* sum) {
+    const Lanes residual = planes.residuals(patch, j);
+    *sum += residual * residual;
+  });
+  const Flags is_broad = planes.middle > breadth * planes.high;
+  return where(is_broad & (patch.weight[count - 1] > 0), roots_of(squares[0] / float(count - 3)),
+               all(INFINITE));
 }
 
-// torchrg.normals.consensus.noise._layered_deviations: residual of two parallel planes, without the
-// checks of the result.
-INLINE float of_layers(const Patch& patch, Plane plane, float count, int num_refits,
-                       float min_count) {
-  alignas(32) float sides[2][MAX_WIDTH];
+// torchrg.normals.consensus.noise._layered_deviations: mean squares of the residuals from two
+// parallel planes, without the checks of the result.
+Lanes of_layers(const Patch& patch, Planes planes, Lanes count, int num_refits, float min_count) {
+  static thread_local Column upper, lower;
   for (int turn = 0;; turn++) {
-    float numbers[2], means[2][3], covariances[2][6], pooled[6];
-    for (int j = 0; j < patch.width; j += LANES) {
-      const Lanes weight = load(patch.weight + j);
-      const Lanes upper = where(plane.residuals(patch, j) > 0, weight, all(0));
-      store(sides[0] + j, upper), store(sides[1] + j, weight - upper);
+    Lanes number{};
+    for (int j = 0; j < patch.width; j++) {
+      const Lanes weight = patch.weight[j];
+      upper.set(j, where(planes.residuals(patch, j) > 0, weight, all(0)));
+      lower.set(j, weight - upper[j]), number += upper[j];
     }
-    for (int side = 0; side < 2; side++)
-      numbers[side] = moments(patch, sides[side], patch.width, means[side], covariances[side]);
     if (turn == num_refits)
-      return smaller(numbers[0], numbers[1]) < min_count ? INFINITE : float(plane.low);
+      return where(smaller(number, count - number) < min_count, all(INFINITE), planes.low);
+    const Moments above = moments(patch, upper, patch.width);
+    const Moments below = moments(patch, lower, patch.width);
+    Sums<6> pooled;
     for (int i = 0; i < 6; i++)
-      pooled[i] = numbers[0] / count * covariances[0][i] + numbers[1] / count * covariances[1][i];
-    decompose(pooled, plane);
-    float ends[2];
-    for (int side = 0; side < 2; side++)
-      ends[side] = means[side][0] * plane.a + means[side][1] * plane.b + means[side][2] * plane.c;
-    plane.offset = (ends[0] + ends[1]) / 2;
+      pooled.sums[i] =
+          above.count / count * above.covariance[i] + below.count / count * below.covariance[i];
+    planes = decompose(pooled);
+    planes.offset = (planes.project(above.mean) + planes.project(below.mean)) / 2;
   }
 }
 
@@ -77,102 +73,112 @@ KERNEL survey(int64_t num_points, int64_t num_rows, int64_t k, Floats points, In
               int64_t min_count, float* offsets, float* radius, float* whole, float* layered,
               bool* again, float* of_fewer, float* of_more) {
   if (few < 4 || more < 4 || uint64_t(num_refits) > MAX_WIDTH) return TOO_WIDE;
+  static thread_local Patch thick;
   const Lists lists = {num_points, num_rows, k, points, indices, mask};
-  return visit_patches(lists, nullptr, num_rows, [&](int64_t, int64_t i, const Patch& patch) {
-    again[i] = false;
-    for (int j = 1; j < k; j++)
-      again[i] |= patch.x[j] == patch.x[j - 1] && patch.y[j] == patch.y[j - 1] &&
-                  patch.z[j] == patch.z[j - 1];
-    const float a = normals[3 * i], b = normals[3 * i + 1], c = normals[3 * i + 2];
-    Lanes number{}, sx{}, sy{}, sz{};
-    for (int j = 0; j < patch.width; j += LANES) {
-      number += load(patch.weight + j);
-      sx += load(patch.x + j), sy += load(patch.y + j), sz += load(patch.z + j);
-    }
-    const float count = total(number), some = larger(count, 1.0f);
-    offsets[i] = total(sx) / some * a + total(sy) / some * b + total(sz) / some * c;
-    Lanes second{}, fourth{};
-    for (int j = 0; j < patch.width; j += LANES) {
-      const Lanes residual = patch.along(a, b, c, j) - offsets[i];
-      const Lanes square = residual * residual * load(patch.weight + j);
-      second += square, fourth += square * square;
-    }
-    const float s2 = total(second), s4 = total(fourth);
-    radius[i] = square_root(farthest(patch, patch.weight));
-    whole[i] = valid[i] && count > 3 ? square_root(s2 / larger(count - 3, 1.0f)) : INFINITE;
-    layered[i] = INFINITE;
-    if (s4 * count < float(kurtosis) * s2 * s2 && is_finite(whole[i])) {
-      const float square = of_layers(patch, {a, b, c, offsets[i], 0, 0, 0}, count, int(num_refits),
-                                     float(min_count));
-      const float deviation = square_root(square * count / larger(count - 4, 1.0f));
-      if (deviation <= float(fraction) * whole[i]) layered[i] = deviation;
-    }
-    of_fewer[i] = few <= k ? of_few(patch, int(few), float(breadth)) : INFINITE;
-    of_more[i] = more <= k ? of_few(patch, int(more), float(breadth)) : INFINITE;
-  });
+  Rows flat;
+  flat.used = 0;
+  const auto try_layers = [&] {
+    gather(lists, flat, thick);
+    Lanes count{};
+    for (int j = 0; j < k; j++) count += thick.weight[j];
+    const Lanes square = of_layers(thick, planes_of(flat, normals, offsets), count, int(num_refits),
+                                   float(min_count));
+    const Lanes found = roots_of(square * count / larger(count - 4, all(1)));
+    const Flags is_layered = found <= float(fraction) * flat.of(whole);
+    flat.write(where(is_layered, found, all(INFINITE)), layered), flat.used = 0;
+  };
+  const int64_t status =
+      visit_patches(lists, nullptr, num_rows, [&](const Rows& rows, const Patch& patch) {
+        Flags repeats{};
+        for (int j = 1; j < k; j++)
+          repeats = repeats | ((patch.x[j] == patch.x[j - 1]) & (patch.y[j] == patch.y[j - 1]) &
+                               (patch.z[j] == patch.z[j - 1]));
+        Planes planes = planes_of(rows, normals);
+        const Sums<4> sums = add_up<4>(patch.width, [&](int j, Lanes* sum) {
+          sum[0] += patch.weight[j];
+          sum[1] += patch.x[j], sum[2] += patch.y[j], sum[3] += patch.z[j];
+        });
+        const Lanes count = sums[0], some = larger(count, all(1));
+        const Lanes center[3] = {sums[1] / some, sums[2] / some, sums[3] / some};
+        planes.offset = planes.project(center);
+        const Sums<2> powers = add_up<2>(patch.width, [&](int j, Lanes* sum) {
+          const Lanes residual = planes.residuals(patch, j);
+          const Lanes square = residual * residual * patch.weight[j];
+          sum[0] += square, sum[1] += square * square;
+        });
+        const Lanes deviation =
+            where(rows.flags(valid) & (count > 3), roots_of(powers[0] / larger(count - 3, all(1))),
+                  all(INFINITE));
+        const Flags is_flat =
+            (powers[1] * count < float(kurtosis) * powers[0] * powers[0]) & (deviation < INFINITE);
+        rows.write(planes.offset, offsets), rows.write(deviation, whole);
+        rows.write(all(INFINITE), layered);
+        rows.write(roots_of(farthest(patch, patch.weight)), radius);
+        rows.write(few <= k ? of_few(patch, int(few), float(breadth)) : all(INFINITE), of_fewer);
+        rows.write(more <= k ? of_few(patch, int(more), float(breadth)) : all(INFINITE), of_more);
+        for (int l = 0; l < rows.used; l++) {
+          again[rows.positions[l]] = repeats[l];
+          if (is_flat[l] && flat.add(rows.numbers[l])) try_layers();
+        }
+      });
+  if (flat.used > 0) try_layers();
+  return status;
 }
 
 namespace {
 
-// Order-preserving integer keys of floats, and back; the bits of negative floats are inverted.
-INLINE int32_t as_key(float value) {
-  int32_t key;
-  __builtin_memcpy(&key, &value, sizeof key);
-  return key < 0 ? key ^ INT32_MAX : key;
-}
-INLINE float of_key(int32_t key) {
-  if (key < 0) key ^= INT32_MAX;
-  float value;
-  __builtin_memcpy(&value, &key, sizeof value);
-  return value;
-}
+// Order-preserving integer keys of the bits of floats, and back: those of negative ones are inverted.
+INLINE Flags ordered(Flags bits) { return bits ^ ((bits >> 31) & INT32_MAX); }
 
 constexpr int QUICK_TURNS = 4;  // the fastest of 0 to 5 for 50 keys
 
 INLINE Flags middle_of(Flags low, Flags high) { return (low & high) + ((low ^ high) >> 1); }
 
-// The key of a given rank, from 1, among the k keys of each lane.
-INLINE Flags select(const int32_t* keys, int k, Flags ranks) {
-  Flags low = load(keys), high = low;
-  for (int j = 1; j < k; j++) {
-    const Flags key = load(keys + LANES * j);
-    low = smaller(key, low), high = larger(key, high);
+// Of the k values of each lane, given as bits, the value of a rank, from 1.
+INLINE Flags select(int32_t* keys, int k, Flags ranks) {
+  Flags low = ordered(load(keys)), high = low;
+  for (int j = 0; j < k; j++) {
+    const Flags key = ordered(load(keys + LANES * j));
+    store(keys + LANES * j, key), low = smaller(key, low), high = larger(key, high);
   }
+  const Flags num_above = k - ranks;
   // Halve the range without its keys first, at a fourth of the cost.
   for (int turn = 0; turn < QUICK_TURNS; turn++) {
     const Flags middle = middle_of(low, high);
-    Flags missing = ranks;
-    for (int j = 0; j < k; j++) missing += load(keys + LANES * j) <= middle;
-    const Flags is_high = missing <= 0;
+    Flags missing = num_above;
+    for (int j = 0; j < k; j++) missing += load(keys + LANES * j) > middle;
+    const Flags is_high = missing >= 0;
     low = where(is_high, low, smaller(middle + 1, high)), high = where(is_high, middle, high);
   }
   while (total(low < high)) {
     const Flags middle = middle_of(low, high);
-    Flags count{}, below = low, above = high;
+    Flags missing = num_above, below = low, above = high;
     for (int j = 0; j < k; j++) {
-      const Flags key = load(keys + LANES * j), within = key <= middle;
-      count -= within;
-      below = where(within, larger(key, below), below);
-      above = where(within, above, smaller(key, above));
+      const Flags key = load(keys + LANES * j), beyond = key > middle;
+      missing += beyond;
+      below = where(beyond, below, larger(key, below));
+      above = where(beyond, smaller(key, above), above);
     }
-    const Flags is_high = count >= ranks;
-    low = where(is_high, where(count == ranks, below, low), above);
-    high = where(is_high, below, where(count == ranks - 1, above, high));
+    const Flags is_high = missing >= 0;
+    low = where(is_high, where(missing == 0, below, low), above);
+    high = where(is_high, below, where(missing == -1, above, high));
   }
-  return low;
+  return ordered(low);
 }
 
-// Gathers some adjacent columns of the neighbors of a row as keys, from a lane on; returns the
-// number of counted neighbors.
+// Gathers some adjacent columns of the neighbors of a row, from a lane on; returns the number of
+// counted neighbors.
 template <int num_lanes>
-INLINE int gather_keys(const float* column, int64_t num_columns, const int32_t* row,
-                       const bool* counted, int64_t k, int lane, int32_t* keys) {
+INLINE int gather_values(Floats column, int64_t num_columns, Ints row, Flagged counted, int64_t k,
+                         int lane, int32_t* values) {
+  float others[num_lanes];
+  for (float& other : others) other = INFINITE;
   int count = 0;
   for (int64_t j = 0; j < k; j++) {
     const bool counts = !counted || counted[j];
     count += counts;
-    for (int l = 0; l < num_lanes; l++)
-      keys[LANES * j + lane + l] = as_key(counts ? column[num_columns * row[j] + l] : INFINITE);
+    __builtin_memcpy(values + LANES * j + lane, counts ? column + num_columns * row[j] : others,
+                     sizeof others);
   }
   return count;
 }
@@ -195,16 +201,16 @@ KERNEL neighbor_quantiles(int64_t num_points, int64_t num_columns, int64_t num_r
       if (!are_rows(row, k, num_points)) return NO_SUCH_ROW;
       width = num_columns % 4 == 0 && start + lane + 4 <= num_found ? 4 : 1;
       const int count = width == 4
-                            ? gather_keys<4>(column, num_columns, row, counted, k, lane, keys)
-                            : gather_keys<1>(column, num_columns, row, counted, k, lane, keys);
+                            ? gather_values<4>(column, num_columns, row, counted, k, lane, keys)
+                            : gather_values<1>(column, num_columns, row, counted, k, lane, keys);
       for (int l = lane; l < lane + width; l++) {
         ranks[l] = int(rank_of_all);
         if (mask) ranks[l] = larger(int(__builtin_ceilf(float(quantile) * float(count))), 1);
       }
     }
     const Flags selected = select(keys, int(k), load(ranks));
-    for (int lane = 0; lane < LANES && start + lane < num_found; lane++)
-      found[start + lane] = of_key(selected[lane]);
+    const int64_t count = smaller(num_found - start, int64_t(LANES));
+    __builtin_memcpy(found + start, &selected, uint64_t(count) * sizeof *found);
   }
   return DONE;
 }

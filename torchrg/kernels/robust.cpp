@@ -1,7 +1,7 @@
 // Robust fits of many patches, one patch per lane, bit-identical to torchrg/robust.
 //
 // Sums run over the points in order. Columns (K, M) hold point k of patch m at k * M + m.
-#include "plain.h"
+#include "patches.h"
 
 // A loop that needs the registers for itself.
 #define SEPARATE __attribute__((noinline))
@@ -14,23 +14,6 @@ constexpr float MARGIN = 0.6f;         // the number by which the nearest limit 
 constexpr int MAX_DIFFERENCES = 2048;  // in a window
 constexpr int NUM_WINDOWS = 2;         // windows before all differences are searched
 constexpr int FREE_TURNS = 4;          // turns after which a search bisects
-
-// One coordinate of the points of eight patches.
-struct Column {
-  alignas(32) float values[MAX_WIDTH * LANES];
-
-  INLINE_MEMBER Lanes operator[](int k) const { return load(values + k * LANES); }
-  INLINE_MEMBER void set(int k, Lanes lanes) { store(values + k * LANES, lanes); }
-  INLINE_MEMBER float& at(int k, int lane) { return values[k * LANES + lane]; }
-  // Replaces lanes by those of another column, or by one of its lanes.
-  INLINE_MEMBER void replace(Flags lanes, const Column& other, int n) {
-    for (int k = 0; k < n; k++) set(k, where(lanes, other[k], (*this)[k]));
-  }
-  INLINE_MEMBER void replace(Flags lanes, const Column& other, int64_t lane, int n) {
-    const float* from = other.values + lane;
-    for (int k = 0; k < n; k++) set(k, where(lanes, all(from[k * LANES]), (*this)[k]));
-  }
-};
 
 struct Points {
   Column columns[3];
@@ -75,26 +58,6 @@ void sort_lanes(Column& rows, int n) {
 INLINE Lanes median_of_sorted(const Column& rows, int n) {
   const Lanes low = rows[(n - 1) / 2], high = rows[n / 2];
   return n % 2 ? low : low + (high - low) / all(2);
-}
-
-INLINE Lanes roots_of(Lanes squares) {
-  float lanes[LANES];
-  store(lanes, squares);
-  for (float& lane : lanes) lane = square_root(lane);
-  return load(lanes);
-}
-
-INLINE Lanes one_where(Flags flags) { return where(flags, all(1), all(0)); }
-
-// Whether a lane is negative, such as true.
-INLINE bool is_any(Flags flags) {
-#ifdef __AVX__
-  return __builtin_ia32_movmskps256((Lanes)flags) != 0;
-#elif defined(__SSE__)
-  return __builtin_ia32_movmskps((FourFloats)(flags.low | flags.high)) != 0;
-#else
-  return total(flags >> 31) != 0;
-#endif
 }
 
 // Limits of a value: `few` values, too few, are at most `low`, and `many` at most `high`.

@@ -1,0 +1,390 @@
+// Eight neighborhoods at a time, one per lane, so that no sum and no choice crosses lanes.
+#pragma once
+#include "plain.h"
+
+// One number per point of eight neighborhoods, one neighborhood per lane.
+struct Column {
+  // 17 lines of a cache of 64 sets follow, so that columns do not displace each other.
+  alignas(32) float values[MAX_WIDTH * LANES + 17 * 16];
+
+  INLINE_MEMBER Lanes operator[](int j) const { return load(values + j * LANES); }
+  INLINE_MEMBER void set(int j, Lanes lanes) { store(values + j * LANES, lanes); }
+  INLINE_MEMBER float& at(int j, int lane) { return values[j * LANES + lane]; }
+  INLINE_MEMBER float at(int j, int lane) const { return values[j * LANES + lane]; }
+  INLINE_MEMBER void set_half(int j, int lane, FourFloats four) {
+    __builtin_memcpy(values + j * LANES + lane, &four, sizeof four);
+  }
+  // Replaces lanes by those of another column, or by one of its lanes.
+  INLINE_MEMBER void replace(Flags lanes, const Column& other, int n) {
+    for (int k = 0; k < n; k++) set(k, where(lanes, other[k], (*this)[k]));
+  }
+  INLINE_MEMBER void replace(Flags lanes, const Column& other, int64_t lane, int n) {
+    const float* from = other.values + lane;
+    for (int k = 0; k < n; k++) set(k, where(lanes, all(from[k * LANES]), (*this)[k]));
+  }
+};
+
+template <int T>
+struct Sums {
+  Lanes sums[T];
+
+  INLINE_MEMBER const Lanes& operator[](int t) const { return sums[t]; }
+};
+
+// torchrg.linalg.moments.sum_neighbors of T terms: eight partial sums, then sums of these.
+template <int T, class Add>
+INLINE Sums<T> add_up(int width, const Add& add) {
+  Lanes parts[LANES][T];
+  for (int first = 0; first < LANES; first++) {
+    Lanes part[T] = {};
+    for (int j = first; j < width; j += LANES) add(j, part);
+    for (int t = 0; t < T; t++) parts[first][t] = part[t];
+  }
+  Sums<T> found;
+  for (int t = 0; t < T; t++)
+    found.sums[t] = ((parts[0][t] + parts[4][t]) + (parts[2][t] + parts[6][t])) +
+                    ((parts[1][t] + parts[5][t]) + (parts[3][t] + parts[7][t]));
+  return found;
+}
+
+// Eight neighborhoods relative to their first points; weights are 0 or 1.
+struct Patch {
+  Column x, y, z, weight;
+  int width;
+
+  INLINE_MEMBER Lanes along(Lanes a, Lanes b, Lanes c, int j) const {
+    return x[j] * a + y[j] * b + z[j] * c;
+  }
+  INLINE_MEMBER Lanes sq_lengths(int j) const { return x[j] * x[j] + y[j] * y[j] + z[j] * z[j]; }
+};
+
+// Eight rows of arrays, and the positions of their results.
+struct Rows {
+  int used;  // lanes; the others repeat a row
+  int64_t numbers[LANES], positions[LANES];
+
+  // Takes rows of `numbers`, or the numbers themselves, from `start` on; false if out of range.
+  INLINE_MEMBER bool set(Longs rows, int64_t start, int64_t end, int64_t num_rows) {
+    used = int(smaller(end - start, int64_t(LANES)));
+    bool inside = true;
+    for (int lane = 0; lane < LANES; lane++) {
+      positions[lane] = start + smaller(lane, used - 1);
+      numbers[lane] = rows ? rows[positions[lane]] : positions[lane];
+      inside &= numbers[lane] >= 0 && numbers[lane] < num_rows;
+    }
+    return inside;
+  }
+  // Adds a row, whose results go to the position of the same number; returns whether all lanes are used.
+  INLINE_MEMBER bool add(int64_t number) {
+    for (int lane = used; lane < LANES; lane++) numbers[lane] = positions[lane] = number;
+    return ++used == LANES;
+  }
+  // Column `column` of an array of such rows.
+  INLINE_MEMBER Lanes of(Floats values, int num_columns = 1, int column = 0) const {
+    float lanes[LANES];
+    for (int lane = 0; lane < LANES; lane++)
+      lanes[lane] = values[num_columns * numbers[lane] + column];
+    return load(lanes);
+  }
+  // The same of their neighbors of one rank.
+  INLINE_MEMBER Lanes near(Floats values, Ints indices, int64_t k, int64_t rank, int num_columns,
+                           int column) const {
+    float lanes[LANES];
+    for (int lane = 0; lane < LANES; lane++)
+      lanes[lane] = values[num_columns * int64_t(indices[numbers[lane] * k + rank]) + column];
+    return load(lanes);
+  }
+  INLINE_MEMBER Flags flags(Flagged mask, int64_t k = 1, int64_t column = 0) const {
+    float lanes[LANES];
+    for (int lane = 0; lane < LANES; lane++) lanes[lane] = mask[numbers[lane] * k + column];
+    return load(lanes) > 0;
+  }
+  INLINE_MEMBER void write(Lanes lanes, float* values, int num_columns = 1, int column = 0) const {
+    float found[LANES];
+    store(found, lanes);
+    for (int lane = 0; lane < used; lane++)
+      values[num_columns * positions[lane] + column] = found[lane];
+  }
+};
+
+// Points (N, 3), neighbor lists of length k, and an optional mask of counted neighbors.
+struct Lists {
+  int64_t num_points, num_lists, k;
+  const float* points;
+  const int32_t* indices;
+  const bool* mask;
+};
+
+#if defined(__clang__) || __GNUC__ >= 12
+#define SHUFFLED(a, b, i, j, k, l) __builtin_shufflevector(a, b, i, j, k, l)
+#else
+#define SHUFFLED(a, b, i, j, k, l) __builtin_shuffle(a, b, FourFlags{i, j, k, l})
+#endif
+
+// Transposes four rows.
+INLINE void transpose(FourFloats (&rows)[4]) {
+  const FourFloats a = SHUFFLED(rows[0], rows[1], 0, 4, 1, 5),
+                   b = SHUFFLED(rows[2], rows[3], 0, 4, 1, 5),
+                   c = SHUFFLED(rows[0], rows[1], 2, 6, 3, 7),
+                   d = SHUFFLED(rows[2], rows[3], 2, 6, 3, 7);
+  rows[0] = SHUFFLED(a, b, 0, 1, 4, 5), rows[1] = SHUFFLED(a, b, 2, 3, 6, 7);
+  rows[2] = SHUFFLED(c, d, 0, 1, 4, 5), rows[3] = SHUFFLED(c, d, 2, 3, 6, 7);
+}
+
+// Whether the lists of rows have valid indices; fetches the lists of the next rows into the cache.
+INLINE bool are_lists(Ints indices, int64_t k, const Rows& rows, int64_t num_points) {
+  constexpr int LINE = 16;
+  for (int64_t j = 0; j < LANES * k; j += LINE)
+    __builtin_prefetch(indices + (rows.numbers[LANES - 1] + 1) * k + j);
+  bool inside = true;
+  for (int64_t number : rows.numbers) inside &= are_rows(indices + number * k, k, num_points);
+  return inside;
+}
+
+// Gathers the neighbors of lists; false if an index is out of range.
+INLINE bool gather(const Lists& lists, const Rows& rows, Patch& patch) {
+  const int k = patch.width = int(lists.k);
+  if (!are_lists(lists.indices, k, rows, lists.num_points)) return false;
+  for (int half = 0; half < LANES; half += 4) {
+    FourFloats first[4];
+    for (int j = 0; j < k; j++) {
+      FourFloats found[4];
+      for (int lane = 0; lane < 4; lane++) {
+        const int32_t row = lists.indices[rows.numbers[half + lane] * k + j];
+        const float* point = lists.points + 3 * int64_t(row);
+        double pair;
+        __builtin_memcpy(&pair, point, sizeof pair);
+        found[lane] = FourFloats(TwoDoubles{pair, 0});
+        found[lane][2] = point[2];
+      }
+      transpose(found);
+      for (int axis = 0; axis < 3; axis++) {
+        if (j == 0) first[axis] = found[axis];
+        found[axis] -= first[axis];
+      }
+      patch.x.set_half(j, half, found[0]), patch.y.set_half(j, half, found[1]);
+      patch.z.set_half(j, half, found[2]), patch.weight.set(j, all(1));
+    }
+  }
+  if (lists.mask)
+    for (int j = 0; j < k; j++) {
+      for (int lane = 0; lane < LANES; lane++)
+        patch.weight.at(j, lane) = lists.mask[rows.numbers[lane] * k + j];
+      const Flags counts = patch.weight[j] > 0;
+      Column* columns[] = {&patch.x, &patch.y, &patch.z};
+      for (Column* column : columns) column->set(j, where(counts, (*column)[j], all(0)));
+    }
+  return true;
+}
+
+// Calls `visit` with rows and their patches, eight at a time, for all lists or n rows.
+template <class Visit>
+INLINE int64_t visit_patches(const Lists& lists, Longs rows, int64_t n, const Visit& visit) {
+  if (lists.k < 1 || lists.k > MAX_WIDTH) return TOO_WIDE;
+  static thread_local Patch patch;
+  Rows eight;
+  for (int64_t q = 0; q < n; q += LANES) {
+    if (!eight.set(rows, q, n, lists.num_lists) || !gather(lists, eight, patch)) return NO_SUCH_ROW;
+    visit(eight, patch);
+  }
+  return DONE;
+}
+
+// Planes normal . q = offset, the eigenvalues of their covariances, and their weights.
+struct Planes {
+  Lanes a{}, b{}, c{}, offset{}, low{}, middle{}, high{}, count{};
+
+  INLINE_MEMBER Lanes residuals(const Patch& patch, int j) const {
+    return patch.along(a, b, c, j) - offset;
+  }
+  INLINE_MEMBER Lanes project(const Lanes (&point)[3]) const {
+    return a * point[0] + b * point[1] + c * point[2];
+  }
+  INLINE_MEMBER void write(const Rows& rows, float* normals, float* offsets = nullptr) const {
+    rows.write(a, normals, 3, 0), rows.write(b, normals, 3, 1), rows.write(c, normals, 3, 2);
+    if (offsets) rows.write(offset, offsets);
+  }
+};
+INLINE Planes planes_of(const Rows& rows, Floats normals, Floats offsets = nullptr) {
+  return {rows.of(normals, 3, 0), rows.of(normals, 3, 1), rows.of(normals, 3, 2),
+          offsets ? rows.of(offsets) : Lanes{}};
+}
+INLINE Planes where(Flags flags, const Planes& p, const Planes& q) {
+  return {where(flags, p.a, q.a),       where(flags, p.b, q.b),
+          where(flags, p.c, q.c),       where(flags, p.offset, q.offset),
+          where(flags, p.low, q.low),   where(flags, p.middle, q.middle),
+          where(flags, p.high, q.high), where(flags, p.count, q.count)};
+}
+
+struct Vector {
+  double x, y, z;
+};
+
+// torchrg.linalg.eigen._orthogonal: a unit vector orthogonal to the direction of a rank-one matrix.
+static Vector across(Vector first, Vector second, Vector third) {
+  Vector row = second.y > first.x ? second : first;
+  if (third.z > larger(first.x, second.y)) row = third;
+  const double sizes[3] = {size_of(row.x), size_of(row.y), size_of(row.z)};
+  const bool is_z = sizes[2] < smaller(sizes[0], sizes[1]), is_y = !is_z && sizes[1] < sizes[0];
+  const double i = !is_y && !is_z, j = is_y, k = is_z;
+  const Vector found = {row.y * k - row.z * j, row.z * i - row.x * k, row.x * j - row.y * i};
+  const double length = square_root(found.x * found.x + found.y * found.y + found.z * found.z);
+  if (!(length > 0)) return {i, j, k};
+  return {found.x / length, found.y / length, found.z / length};
+}
+
+// The doubles that a register holds.
+#ifdef __AVX__
+constexpr int WIDE = 4;
+#else
+constexpr int WIDE = 2;
+#endif
+typedef double Wide __attribute__((vector_size(8 * WIDE)));
+typedef float Narrow __attribute__((vector_size(4 * WIDE)));
+typedef int64_t WideFlags __attribute__((vector_size(8 * WIDE)));
+INLINE Wide larger(Wide a, Wide b) { return a < b ? b : a; }
+INLINE Wide size_of(Wide a) { return a < 0 ? -a : a; }
+INLINE Wide square_root(Wide a) {
+  for (int i = 0; i < WIDE; i++) a[i] = square_root(a[i]);
+  return a;
+}
+INLINE bool is_any(WideFlags flags) {
+  int64_t any = 0;
+  for (int i = 0; i < WIDE; i++) any |= flags[i];
+  return any != 0;
+}
+
+// torchrg.linalg.smallest_eigenvector3, bit-identical, of some lanes.
+struct Eigenvectors {
+  Wide xx, xy, xz, yy, yz, zz, safe, trace, minors, determinant, root;
+  WideFlags moves;
+
+  INLINE_MEMBER void start(const Wide (&covariances)[6]) {
+    Wide scale{};
+    for (const Wide& entry : covariances) scale = larger(scale, size_of(entry));
+    safe = scale > 0 ? scale : Wide{} + 1;
+    xx = covariances[0] / safe, xy = covariances[1] / safe, xz = covariances[2] / safe;
+    yy = covariances[3] / safe, yz = covariances[4] / safe, zz = covariances[5] / safe;
+    trace = xx + yy + zz;
+    minors = xx * yy - xy * xy + (xx * zz - xz * xz) + (yy * zz - yz * yz);
+    determinant = zz * (xx * yy - xy * xy) - yz * (xx * yz - xy * xz) + xz * (xy * yz - yy * xz);
+    root = Wide{}, moves = ~WideFlags{};
+  }
+  // One step of Newton's method towards the smallest root.
+  INLINE_MEMBER void step(bool may_stop) {
+    constexpr double CONVERGED = 1e-9;
+    const Wide value = ((root - trace) * root + minors) * root - determinant;
+    const Wide slope = (3 * root - 2 * trace) * root + minors;
+    const Wide step = value / slope, size = size_of(step);
+    const WideFlags can_move = moves & (size < double(INFINITE));
+    root = can_move ? root - step : root;
+    if (may_stop) moves = can_move & (size > CONVERGED * trace);
+  }
+  // The vector, and the eigenvalues in ascending order.
+  INLINE_MEMBER void finish(Wide (&found)[6]) const {
+    constexpr double NEARLY_EQUAL = 1e-9;
+    const Wide x = xx - root, y = yy - root, z = zz - root;
+    const Wide a = y * z - yz * yz, b = x * z - xz * xz, c = x * y - xy * xy;
+    const Wide ab = xz * yz - xy * z, ac = xy * yz - xz * y, bc = xy * xz - x * yz;
+    const WideFlags is_second = b > a, is_third = c > larger(a, b);
+    Wide u = is_third    ? ac
+             : is_second ? ab
+                         : a,
+         v = is_third    ? bc
+             : is_second ? b
+                         : ab,
+         w = is_third    ? c
+             : is_second ? bc
+                         : ac;
+    const Wide length = square_root(u * u + v * v + w * w);
+    u /= length, v /= length, w /= length;
+    const WideFlags is_line = larger(larger(a, b), c) < NEARLY_EQUAL;
+    for (int i = 0; i < WIDE && is_any(is_line); i++) {
+      if (!is_line[i]) continue;
+      const Vector normal =
+          across({x[i], xy[i], xz[i]}, {xy[i], y[i], yz[i]}, {xz[i], yz[i], z[i]});
+      u[i] = normal.x, v[i] = normal.y, w[i] = normal.z;
+    }
+    const Wide low = larger(
+        u * (u * xx + 2 * (v * xy + w * xz)) + v * (v * yy + 2 * w * yz) + w * w * zz, Wide{});
+    const Wide remaining = trace - low;
+    const Wide spread =
+        square_root(larger(remaining * remaining - 4 * (minors - low * remaining), Wide{}));
+    found[0] = u, found[1] = v, found[2] = w, found[3] = low * safe;
+    found[4] = larger((remaining - spread) / 2, Wide{}) * safe;
+    found[5] = larger((remaining + spread) / 2, Wide{}) * safe;
+  }
+};
+
+// Normals and eigenvalues of covariances xx xy xz yy yz zz.
+static Planes decompose(const Sums<6>& covariances) {
+  constexpr int FIRST_STEPS = 4, STEPS = 40, PARTS = LANES / WIDE;
+  Narrow columns[6][PARTS];
+  for (int i = 0; i < 6; i++) __builtin_memcpy(columns[i], &covariances[i], sizeof(Lanes));
+  Eigenvectors parts[PARTS];
+  WideFlags moves = ~WideFlags{};
+  Wide wide[6];
+  for (int part = 0; part < PARTS; part++) {
+    for (int i = 0; i < 6; i++) wide[i] = __builtin_convertvector(columns[i][part], Wide);
+    parts[part].start(wide);
+  }
+  for (int i = 1; i <= STEPS && is_any(moves); i++) {
+    moves = WideFlags{};
+    for (Eigenvectors& part : parts) part.step(i >= FIRST_STEPS), moves |= part.moves;
+  }
+  for (int part = 0; part < PARTS; part++) {
+    parts[part].finish(wide);
+    for (int i = 0; i < 6; i++) columns[i][part] = __builtin_convertvector(wide[i], Narrow);
+  }
+  Lanes found[6];
+  for (int i = 0; i < 6; i++) __builtin_memcpy((void*)&found[i], columns[i], sizeof(Lanes));
+  return {found[0], found[1], found[2], Lanes{}, found[3], found[4], found[5]};
+}
+
+// Weight sums, means and covariances of patches with nonnegative weights.
+struct Moments {
+  Lanes count, mean[3];
+  Sums<6> covariance;
+};
+INLINE Moments moments(const Patch& patch, const Column& weights, int width) {
+  const Sums<4> sums = add_up<4>(width, [&](int j, Lanes* sum) {
+    const Lanes weight = weights[j];
+    sum[0] += weight, sum[1] += weight * patch.x[j];
+    sum[2] += weight * patch.y[j], sum[3] += weight * patch.z[j];
+  });
+  const Lanes inverse = where(sums[0] > 0, 1 / sums[0], all(1));
+  const Lanes a = sums[1] * inverse, b = sums[2] * inverse, c = sums[3] * inverse;
+  const Sums<6> covariance = add_up<6>(width, [&](int j, Lanes* sum) {
+    const Lanes x = patch.x[j] - a, y = patch.y[j] - b, z = patch.z[j] - c;
+    const Lanes scaled = weights[j] * inverse, wx = scaled * x, wy = scaled * y;
+    sum[0] += wx * x, sum[1] += wx * y, sum[2] += wx * z;
+    sum[3] += wy * y, sum[4] += wy * z, sum[5] += scaled * z * z;
+  });
+  return {sums[0], {a, b, c}, covariance};
+}
+
+INLINE Lanes farthest(const Patch& patch, const Column& weights) {
+  Lanes maximum{};
+  for (int j = 0; j < patch.width; j++) maximum = larger(maximum, patch.sq_lengths(j) * weights[j]);
+  return maximum;
+}
+
+// torchrg.normals.consensus.hypotheses.support_scores of planes in units of the reach.
+INLINE Lanes support(const Patch& patch, const Column& weights, Lanes a, Lanes b, Lanes c,
+                     Lanes offset) {
+  const Sums<3> sums = add_up<3>(patch.width, [&](int j, Lanes* sum) {
+    const Lanes residual = patch.along(a, b, c, j) - offset, weight = weights[j];
+    sum[0] += positive(1 - residual * residual) * weight;
+    sum[1] += where(residual > 1, weight, all(0));
+    sum[2] += where(residual < -1, weight, all(0));
+  });
+  return sums[0] - smaller(sums[1], sums[2]);
+}
+
+// torchrg.linalg.moments.fit_weighted_planes.
+INLINE Planes fit_planes(const Patch& patch, const Column& weights, int width) {
+  const Moments found = moments(patch, weights, width);
+  Planes planes = decompose(found.covariance);
+  planes.offset = planes.project(found.mean), planes.count = found.count;
+  return planes;
+}
