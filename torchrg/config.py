@@ -9,7 +9,7 @@ import math
 import numbers
 import types
 import typing
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
@@ -633,9 +633,14 @@ def settings_of(
 def _read_config(name_or_file: str | Path, caller: str) -> PipelineConfig:
     """Read the settings of a preset or a file."""
     path = Path(name_or_file)
-    if path.suffix not in (".yaml", ".yml"):
-        expected = f"{caller}{': ' * bool(caller)}expected a .yaml file, or a preset, one of"
-        path = _preset_file(str(name_or_file), expected=expected)
+    if path.suffix in (".yaml", ".yml"):
+        return _read_file(path)
+    expected = f"{caller}{': ' * bool(caller)}expected a .yaml file, or a preset, one of"
+    return _find_preset(str(name_or_file), expected=expected)
+
+
+def _read_file(path: Path) -> PipelineConfig:
+    """Read the settings of a file."""
     import yaml
 
     try:
@@ -648,6 +653,10 @@ def _read_config(name_or_file: str | Path, caller: str) -> PipelineConfig:
     return _apply_to_base({} if values is None else values, str(path))
 
 
+_read_preset = cache(_read_file)
+"""The settings of the file of a preset, which is read once."""
+
+
 def _apply_to_base(values: object, where: str) -> PipelineConfig:
     """Apply the values of a file or dictionary to its base."""
     base: object = PipelineConfig()
@@ -655,19 +664,18 @@ def _apply_to_base(values: object, where: str) -> PipelineConfig:
         base = values["base"]
         values = {key: value for key, value in values.items() if key != "base"}
     if not isinstance(base, PipelineConfig):
-        expected = f"{where}: expected base to be one of"
-        base = _read_config(_preset_file(base, expected=expected), where)
+        base = _find_preset(base, expected=f"{where}: expected base to be one of")
     return _override(base, values, where)
 
 
-def _preset_file(name: object, *, expected: str) -> Path:
-    """Return the file of a preset; raise if it does not exist."""
+def _find_preset(name: object, *, expected: str) -> PipelineConfig:
+    """Return the settings of a preset; raise if it does not exist."""
     if name not in preset_names():
         from torchrg._synonyms import advice_on
 
         advice = advice_on(str(name)) and f"; {advice_on(str(name))}"
         raise ConfigError(f"{expected} {', '.join(preset_names())}, got {shown(name)}{advice}.")
-    return _preset_folder() / f"{name}.yaml"
+    return _read_preset(_preset_folder() / f"{name}.yaml")
 
 
 def _override(config: Settings, values: object, where: str, prefix: str = "") -> Settings:
@@ -716,7 +724,7 @@ def _fix_for(key: str, value: object, config: object, prefix: str) -> str:
 def check_values(config: Any) -> None:  # noqa: ANN401
     """Convert settings to their types, numbers of at most 1e12, or raise; warn about radians."""
     kind = type(config)
-    for name, hint in typing.get_type_hints(kind).items():
+    for name, hint in _hints_of(kind).items():
         value = getattr(config, name)
         if dataclasses.is_dataclass(hint) and isinstance(value, Mapping):
             value = _override(typing.cast(Any, hint)(), value, kind.__name__, f"{name}.")
@@ -728,6 +736,7 @@ def check_values(config: Any) -> None:  # noqa: ANN401
             warn(f"expected degrees, not radians, got {value:g}; pass {math.degrees(value):.3g}.")
 
 
+_hints_of: Callable[[Any], dict[str, Any]] = cache(typing.get_type_hints)
 _MIN_ANGLE_DEG = 0.5
 """Minimum angle without a warning, in degrees. Presets use 5 and more, 0.09 in radians."""
 _BOOLS = dict.fromkeys(("true", "on", "yes"), True) | dict.fromkeys(("false", "off", "no"), False)
@@ -806,10 +815,11 @@ def _convert_to(kind: Any, value: Any) -> Any:  # noqa: ANN401
     raise ValueError
 
 
-def kinds_of(hint: Any) -> list[Any]:  # noqa: ANN401
+@cache
+def kinds_of(hint: Any) -> tuple[Any, ...]:  # noqa: ANN401
     """Return the alternatives of an annotated type."""
     is_union = typing.get_origin(hint) in (types.UnionType, typing.Union)
-    return [*typing.get_args(hint)] if is_union else [hint]
+    return typing.get_args(hint) if is_union else (hint,)
 
 
 def _type_name(kind: Any) -> str:  # noqa: ANN401
