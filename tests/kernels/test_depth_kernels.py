@@ -8,7 +8,6 @@ from tests.made import build_scanned_room, cameras_around, render_depth
 from torchrg.config import DepthConfig
 from torchrg.depth import segment_depth
 from torchrg.depth.camera import make_intrinsics
-from torchrg.depth.faces import _strip_contacts
 from torchrg.depth.growth import PixelGrid, fit_inverse_planes
 from torchrg.depth.pixels import InverseCloud
 from torchrg.linalg.moments import Segments, kth_smallest
@@ -153,9 +152,7 @@ def test_regions_of_an_image_meet_as_by_definition(rng):
 
     def stages():
         fit = fit_inverse_planes(cloud, labels.flatten())
-        planes = torch.randn(27, 3, generator=torch.Generator().manual_seed(1)).double() / 100
-        strips = _strip_contacts(cloud, labels.flatten(), planes, fit.num_points)
-        return [*fit, *PixelGrid(labels.shape).contacts(labels.flatten()), *strips]
+        return [*fit, *PixelGrid(labels.shape).contacts(labels.flatten())]
 
     found = stages()
     assert len(found[-1]) > 20

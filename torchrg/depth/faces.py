@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchrg import kernels
 from torchrg._parallel import nonzero_rows
-from torchrg.depth.passes import has_kernels, has_pair_kernels
+from torchrg.depth.passes import has_kernels
 from torchrg.depth.pixels import InverseCloud
 from torchrg.linalg.angles import deg_to_sq_chord, sq_chords
 from torchrg.regions.fit import RegionPlanes
@@ -97,11 +97,6 @@ def _strip_contacts(
     _, x, y, noise, _ = cloud
     num_regions, image = len(count), labels.view(noise.shape)
     pitch = [float((index[-1] - index[0]) / max(len(index) - 1, 1)) for index in (x, y)]
-    if has_pair_kernels(labels, num_regions):
-        regions, limits = (planes, count), (*pitch, _MAX_NOISE, _MIN_REACH)
-        width, table = kernels.call("strip_contacts", image, x, y, noise, *regions, *limits)
-        strip, face = table.nonzero().unbind(dim=1)
-        return width, strip, face, table[strip, face]
     here, there = boundaries(image, [(1, 0), (0, 1)])
     pairs = torch.stack([labels[here], labels[there]], dim=1)
     sides = torch.cat([pairs.flatten(), image[0], image[-1], image[:, 0], image[:, -1]])

@@ -8,7 +8,7 @@ from torchrg import kernels
 from torchrg._parallel import map_tasks
 from torchrg.config import DepthConfig
 from torchrg.depth.faces import boundaries, hidden_contacts, join_strips
-from torchrg.depth.passes import has_kernels, has_pair_kernels
+from torchrg.depth.passes import has_kernels
 from torchrg.depth.pixels import InverseCloud
 from torchrg.linalg.moments import Segments
 from torchrg.regions.fit import BISQUARE_CUT, MAX_FITTED, RegionPlanes
@@ -109,7 +109,8 @@ class PixelGrid:
     def contacts(self, labels: Tensor) -> tuple[Tensor, Tensor]:
         """Return the pairs of adjacent regions, and the number of contacts of each pair."""
         num_regions, image = int(labels.max()) + 1, labels.view(self.height, self.width)
-        if has_pair_kernels(labels, num_regions):
+        # A table of all pairs has at most one entry per pixel.
+        if has_kernels(labels) and num_regions**2 <= len(labels):
             table = labels.new_empty(num_regions, num_regions)
             kernels.call("count_contacts", image, table)
             pairs = table.nonzero()

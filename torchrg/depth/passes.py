@@ -16,11 +16,6 @@ def has_kernels(image: Tensor) -> bool:
     return image.device.type == "cpu" and kernels.serve()
 
 
-def has_pair_kernels(labels: Tensor, num_regions: int) -> bool:
-    """Return whether kernels support a table of all pairs of regions: at most one per pixel."""
-    return has_kernels(labels) and num_regions**2 <= len(labels)
-
-
 def pass_over_rows(name: str, num_rows: int, *arguments: Tensor | float | None) -> None:
     """Call a kernel that writes a range of rows of its tensors."""
     # Two tasks per thread balance the load.

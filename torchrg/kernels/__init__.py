@@ -81,7 +81,6 @@ SIGNATURES = {
     "assign_unlabeled_pixels": "d[hw] d[w] d[h] b[hw] L[hw] d[M3] d[M3] d[M] -> l[hw] l[hw] l[hw]",
     "move_to_creases": "d[hw] d[w] d[h] L[hw] d[M3] d[M2] d[M] n x -> l[hw] l[hw] l[hw]",
     "count_contacts": "l[hw] L[MM] -> ",
-    "strip_contacts": "l[hw] d[w] d[h] d[hw] d[M3] l[M] x x x x -> d[M] l[MM]",
     "count_lines": "d[hw] d[w] d[h] b[hw] l[hw] d[M3] d[M3] d[M] l[p2] n x -> l[p] l[M] l[M]",
 }
 """Arguments and results of each kernel.

@@ -532,9 +532,9 @@ struct Front {
 };
 
 // Calls `visit` with the pairs of adjacent pixels that have different labels, along rows, columns
-// and, if asked, diagonals.
+// and diagonals.
 template <class Visit>
-INLINE void visit_borders(int64_t h, int64_t w, Longs labels, bool diagonal, const Visit& visit) {
+INLINE void visit_borders(int64_t h, int64_t w, Longs labels, const Visit& visit) {
   constexpr int64_t BLOCK = 32;
   const auto compare = [&](int64_t i, int64_t other) {
     if (labels[i] != labels[other]) visit(i, other);
@@ -552,7 +552,7 @@ INLINE void visit_borders(int64_t h, int64_t w, Longs labels, bool diagonal, con
       for (int64_t c = left, i = r * w + left; c < right; c++, i++) {
         if (c + 1 < w) compare(i, i + 1);
         if (r + 1 < h) compare(i, i + w);
-        if (diagonal && r + 1 < h && c + 1 < w) compare(i, i + w + 1), compare(i + 1, i + w);
+        if (r + 1 < h && c + 1 < w) compare(i, i + w + 1), compare(i + 1, i + w);
       }
     }
 }
@@ -599,7 +599,7 @@ KERNEL move_to_creases(int64_t h, int64_t w, int64_t M, Doubles values, Doubles 
                        int64_t* chosen) {
   if (!are_labels(labels, h * w, M)) return NO_SUCH_ROW;
   Front front(h, w, rows, marks, chosen);
-  visit_borders(h, w, labels, true, [&](int64_t i, int64_t other) {
+  visit_borders(h, w, labels, [&](int64_t i, int64_t other) {
     if (labels[i] >= 0 && labels[other] >= 0) front.add(i), front.add(other);
   });
   front.spread(
@@ -633,39 +633,9 @@ KERNEL move_to_creases(int64_t h, int64_t w, int64_t M, Doubles values, Doubles 
 KERNEL count_contacts(int64_t h, int64_t w, int64_t M, Longs labels, int64_t* counts) {
   if (!are_labels(labels, h * w, M)) return NO_SUCH_ROW;
   for (int64_t pair = 0; pair < M * M; pair++) counts[pair] = 0;
-  visit_borders(h, w, labels, true, [&](int64_t i, int64_t other) {
+  visit_borders(h, w, labels, [&](int64_t i, int64_t other) {
     const int64_t one = smaller(labels[i], labels[other]), two = larger(labels[i], labels[other]);
     if (one >= 0) counts[one * M + two]++;
-  });
-  return DONE;
-}
-
-// faces.strip_contacts: perimeters and widths of regions, and at how many sides of pixels a region
-// (row) meets another (column) without a step.
-KERNEL strip_contacts(int64_t h, int64_t w, int64_t M, Longs labels, Doubles x, Doubles y,
-                      Doubles noise, Doubles planes, Longs sizes, double x_pitch, double y_pitch,
-                      double max_noise, double min_reach, double* widths, int64_t* counts) {
-  if (!are_labels(labels, h * w, M)) return NO_SUCH_ROW;
-  for (int64_t m = 0; m < M; m++) widths[m] = 0;
-  for (int64_t pair = 0; pair < M * M; pair++) counts[pair] = 0;
-  if (h * w == 0) return DONE;
-  const auto add_side = [&](int64_t pixel) {
-    if (labels[pixel] >= 0) widths[labels[pixel]] += 1;
-  };
-  for (int64_t c = 0; c < w; c++) add_side(c), add_side((h - 1) * w + c);
-  for (int64_t r = 0; r < h; r++) add_side(r * w), add_side(r * w + w - 1);
-  visit_borders(h, w, labels, false,
-                [&](int64_t i, int64_t other) { add_side(i), add_side(other); });
-  for (int64_t m = 0; m < M; m++) widths[m] = double(2 * sizes[m]) / widths[m];
-  visit_borders(h, w, labels, false, [&](int64_t i, int64_t other) {
-    const int64_t one = labels[i], two = labels[other];
-    if (one < 0 || two < 0) return;
-    const double *p = planes + 3 * one, *q = planes + 3 * two;
-    const double a = p[0] - q[0], b = p[1] - q[1], c = p[2] - q[2];
-    const double gap = size_of(a * x[i % w] + b * y[i / w] + c) - max_noise * noise[i];
-    const double slope = square_root(square(a * x_pitch) + square(b * y_pitch));
-    counts[one * M + two] += gap <= slope * larger(widths[one] / 2, min_reach);
-    counts[two * M + one] += gap <= slope * larger(widths[two] / 2, min_reach);
   });
   return DONE;
 }
