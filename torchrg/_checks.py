@@ -196,7 +196,7 @@ def is_concrete(*tensors: Tensor | None) -> bool:
         return False
     try:
         strided = [t for t in tensors if t is not None and t.layout is torch.strided]
-        return all(tensor.data_ptr() >= 0 and tensor.device.type != "meta" for tensor in strided)
+        return all(tensor.data_ptr() >= 0 and not tensor.is_meta for tensor in strided)
     except RuntimeError:  # A tensor wrapper without storage.
         return False
 

@@ -98,6 +98,8 @@ _DTYPES = {
     "b": torch.bool,
 }
 """Dtypes by their letters in a signature."""
+_SERVED = torch.float32, torch.int32, torch.bool
+"""Dtypes of the tensors that kernels process."""
 _FIXED = {str(length): length for length in range(10)}
 """Lengths of axes that a signature fixes."""
 
@@ -116,16 +118,14 @@ def serve(*tensors: Tensor | None, k: int = 1) -> bool:
         >>> serve(torch.zeros(3, dtype=torch.float64))
         False
     """
-    present = [tensor for tensor in tensors if tensor is not None]
     return (
         _library() is not None
         and 0 < k <= MAX_NEIGHBORS
-        and is_concrete(*present)
+        and is_concrete(*tensors)
         and all(
-            tensor.device.type == "cpu"
-            and not tensor.requires_grad
-            and tensor.dtype in (torch.float32, torch.int32, torch.bool)
-            for tensor in present
+            tensor is None
+            or (tensor.is_cpu and not tensor.requires_grad and tensor.dtype in _SERVED)
+            for tensor in tensors
         )
     )
 
@@ -141,21 +141,20 @@ def call(name: str, *arguments: Tensor | float | None) -> tuple[Tensor, ...]:
     if library is None or len(arguments) != len(inputs):
         raise ValueError(f"{name}: expected {len(inputs)} arguments and a library.")
     lengths = _FIXED.copy()
-    taken: list[Tensor | float | None] = []
-    for argument, kind in zip(arguments, inputs, strict=True):
-        taken.append(kind.check(name, argument, lengths))
+    # The tensors stay referenced until the kernel has returned.
+    taken = [kind.take(name, value, lengths) for kind, value in zip(inputs, arguments, strict=True)]
     # Separate lengths are parsed faster than a list.
-    found = tuple(
+    found = [
         torch.empty(*[lengths[axis] for axis in kind.axes], dtype=kind.dtype, device="cpu")
         for kind in outputs
-    )
+    ]
     passed = [v.data_ptr() if isinstance(v, Tensor) else v for v in (*taken, *found)]
     status = getattr(library, name)(*list(lengths.values())[len(_FIXED) :], *passed)
     if status == 1:
         raise IndexError(f"{name}: expected neighbor indices of existing rows, got others.")
     if status:
         raise ValueError(f"{name}: expected rows of 1 to {MAX_NEIGHBORS} values, got {lengths}.")
-    return found
+    return tuple(found)
 
 
 class _Argument(NamedTuple):
@@ -166,23 +165,25 @@ class _Argument(NamedTuple):
     dtype: torch.dtype | None
     optional: bool
 
-    def check(
+    def take(
         self, name: str, value: Tensor | float | None, lengths: dict[str, int]
     ) -> Tensor | float | None:
         """Return the argument as contiguous; record and check the lengths of its axes."""
         if isinstance(value, Tensor):
-            if value.dtype is self.dtype and value.dim() == len(self.axes) and value.is_cpu:
-                agrees = True
-                for axis, length in zip(self.axes, value.shape, strict=True):
+            shape, agrees = value.shape, value.dtype is self.dtype and value.is_cpu
+            if agrees and len(shape) == len(self.axes):
+                for axis, length in zip(self.axes, shape, strict=True):
                     agrees &= lengths.setdefault(axis, length) == length
-                if agrees and (self.letter.islower() or value.is_contiguous()):
+                if agrees and value.is_contiguous():
+                    return value
+                if agrees and self.letter.islower():
                     return value.contiguous()
         elif value is None and self.optional:
             return None
         elif value is not None and self.dtype is None:
             return int(value) if self.letter == "n" else float(value)
-        shape = tuple(value.shape) if isinstance(value, Tensor) else value
-        raise ValueError(f"{name}: expected {self.letter}[{self.axes}], got {shape}, {lengths}.")
+        got = tuple(value.shape) if isinstance(value, Tensor) else value
+        raise ValueError(f"{name}: expected {self.letter}[{self.axes}], got {got}, {lengths}.")
 
 
 @cache
