@@ -44,6 +44,17 @@ def test_every_preset_loads_by_name_and_by_path(path):
     assert load_config(path.stem) == load_config(path)
 
 
+def test_a_preset_is_read_once_and_a_file_each_time(tmp_path, monkeypatch):
+    path = tmp_path / "own.yaml"
+    for angle in (3.0, 4.0):
+        path.write_text(f"base: classic\ngrowing: {{max_angle_deg: {angle}}}\n")
+        assert load_config(path).growing.max_angle_deg == angle
+    classic = load_config("classic")
+    monkeypatch.setattr(Path, "read_text", lambda *_, **__: pytest.fail("read again"))
+    assert load_config("classic") == classic
+    assert load_config({"base": "classic"}) == classic
+
+
 def test_presets_are_those_of_the_contract():
     contract = {"classic", "classic_increment", "detmm", "paper", "algorithm2", "consensus"}
     assert contract <= set(preset_names())

@@ -174,9 +174,7 @@ class _Argument(NamedTuple):
             if agrees and len(shape) == len(self.axes):
                 for axis, length in zip(self.axes, shape, strict=True):
                     agrees &= lengths.setdefault(axis, length) == length
-                if agrees and value.is_contiguous():
-                    return value
-                if agrees and self.letter.islower():
+                if agrees and (self.letter.islower() or value.is_contiguous()):
                     return value.contiguous()
         elif value is None and self.optional:
             return None
