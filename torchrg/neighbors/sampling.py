@@ -99,24 +99,23 @@ def _nearest(
     """
     lists = np.sort(lists, axis=1)
     is_first = np.diff(lists, axis=1, prepend=-1) > 0
-    # Lists of neighbors of neighbors repeat most points: move these to the end, and drop them.
-    order = (~is_first).argsort(axis=1, kind="stable")[:, : is_first.sum(axis=1).max(initial=0)]
-    lists = np.take_along_axis(lists, order, axis=1)
-    is_first = np.take_along_axis(is_first, order, axis=1)
-    cpu = points.detach().cpu()
-    centers = cpu[rows].double().numpy()
-    positions = cpu[lists.ravel()].double().numpy().reshape(*lists.shape, 3) - centers[:, None]
-    distances = np.sqrt((positions * positions).sum(axis=2))
-    distances[~is_first | ((distances == 0) & (lists != rows[:, None]))] = np.inf
+    # Lists of neighbors of neighbors repeat most points: keep one of each, at the beginning.
+    sizes = is_first.sum(axis=1)
+    is_filled = np.arange(sizes.max(initial=0)) < sizes[:, None]
+    distinct = np.zeros(is_filled.shape, dtype=lists.dtype)
+    distinct[is_filled] = lists[is_first]
+    x, y, z = positions = [
+        column[distinct].astype(np.float64) - column[rows].astype(np.float64)[:, None]
+        for column in points.numpy(force=True).T
+    ]
+    distances = np.sqrt(x * x + y * y + z * z)
+    distances[~is_filled | ((distances == 0) & (distinct != rows[:, None]))] = np.inf
     counts = np.isfinite(distances).sum(axis=1)
     count = min(max_count, int(np.median(counts))) if len(rows) else 0
-    order = distances.argsort(axis=1, kind="stable")[counts >= count, :count]
-    chosen = rows[counts >= count]
-    return (
-        chosen,
-        np.take_along_axis(distances[counts >= count], order, axis=1),
-        np.take_along_axis(positions[counts >= count], order[..., None], axis=1),
-    )
+    is_chosen = counts >= count
+    order = distances[is_chosen].argsort(axis=1, kind="stable")[:, :count]
+    near = [np.take_along_axis(v[is_chosen], order, axis=1) for v in (distances, *positions)]
+    return rows[is_chosen], near[0], np.stack(near[1:], axis=2)
 
 
 def _deviations(patches: FloatArray) -> FloatArray:
