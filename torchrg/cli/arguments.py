@@ -89,12 +89,18 @@ class Flag(NamedTuple):
     """Name: ``--section.name``, or a word for a positional argument."""
     spelling: str
     """Name with the placeholder for its value, as in the help."""
-    text: str
+    describe: Callable[[], str]
+    """Returns the text."""
     section: str
     """Section of a setting, as in its name; empty for options."""
     hint: object
     is_required: bool
     numbers: str = ""
+
+    @property
+    def text(self) -> str:
+        """Text of the help, from the source: reading it takes a tenth of a second."""
+        return self.describe()
 
     @property
     def is_positional(self) -> bool:
@@ -322,7 +328,6 @@ def list_flags(
 
     ``default`` has the default values. ``path`` and ``section`` are prefixes of path and name.
     """
-    texts = _field_docstrings(kind)
     for field, hint, argument in _fields(kind):
         value = field.default if default is None else getattr(default, field.name)
         if default is None and field.default_factory is not dataclasses.MISSING:
@@ -332,9 +337,9 @@ def list_flags(
             yield from list_flags(hint, value, f"{path}{field.name}.", inner)
             continue
         front = "" if field.metadata.get("is_short") else section
-        text = plain(argument.text or texts.get(field.name, ""))
-        if "Default:" not in text:
-            text = f"{text} {_default_sentence(value, is_setting=front != '')}".strip()
+        text = functools.partial(
+            _describe_field, kind, field.name, argument.text, value, is_setting=front != ""
+        )
         name = f"--{front}{'.' if front else ''}{field.name}".replace("_", "-")
         if argument.is_positional:
             name = argument.metavar or field.name.upper()
@@ -375,6 +380,16 @@ def _field_docstrings(kind: type) -> dict[str, str]:
             if is_field and isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant):
                 texts[field.target.id] = " ".join(str(below.value.value).split())
     return texts
+
+
+def _describe_field(
+    kind: type, name: str, text: str | None, value: object, *, is_setting: bool
+) -> str:
+    """Return the help text of a field with its default; ``text`` replaces its docstring."""
+    text = plain(text or _field_docstrings(kind).get(name, ""))
+    if "Default:" in text:
+        return text
+    return f"{text} {_default_sentence(value, is_setting=is_setting)}".strip()
 
 
 def _default_sentence(value: object, *, is_setting: bool) -> str:
