@@ -3,10 +3,13 @@
 import dataclasses
 import hashlib
 import json
+import tempfile
 
 import numpy as np
 import pytest
 
+from torchrg import scratch
+from torchrg.batch.memory import scan_memory
 from torchrg.batch.run import list_jobs
 from torchrg.batch.scans import RECORD, convert_scan, reason_to_convert
 from torchrg.batch.sources import CloudSource
@@ -120,6 +123,25 @@ def test_results_are_replaced_by_those_of_other_settings_and_no_others(job_of_a_
     make_claim(job.folder / "provenance.json")
     assert convert_scan(job).status == "converted"
     assert (job.folder / "superpoint.npy").exists()
+
+
+def test_a_scan_above_the_limit_has_its_arrays_on_disk(job_of_a_room, monkeypatch):
+    job, arrays = job_of_a_room(), []
+    convert_scan(job)
+    names = ("plane.npy", "normal.npy", "planes.json")
+    expected = [(job.folder / name).read_bytes() for name in names]
+    assert not job.within(job.memory).on_disk
+    large = job.within(job.memory - 1)
+    assert large.memory == scan_memory(500, on_disk=True) < job.memory
+    monkeypatch.setattr(scratch, "_MIN_BYTES", 0)
+    monkeypatch.setenv("TMPDIR", str(job.out))
+    create = tempfile.TemporaryFile
+    monkeypatch.setattr(
+        tempfile, "TemporaryFile", lambda **_: arrays.append(_["dir"]) or create(**_)
+    )
+    assert convert_scan(large).status == "converted"
+    assert set(arrays) == {job.out}
+    assert [(job.folder / name).read_bytes() for name in names] == expected
 
 
 def test_a_scan_that_failed_keeps_its_table(job_of_a_room, tmp_path, room, monkeypatch):

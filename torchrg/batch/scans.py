@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
+from torchrg import scratch
 from torchrg.batch.memory import scan_memory
 from torchrg.batch.task import Begin, TaskReport, report_on
 from torchrg.config import DepthConfig, PipelineConfig
@@ -97,11 +98,13 @@ class Job:
         source: The data set.
         scan: One of its scans.
         out: Output directory.
+        on_disk: Whether its large arrays go to disk; the results are identical.
     """
 
     source: Source
     scan: SceneFiles
     out: Path
+    on_disk: bool = False
 
     @property
     def name(self) -> str:
@@ -112,7 +115,13 @@ class Job:
     def memory(self) -> int:
         """Maximum memory of a process with this scan, in bytes."""
         k, num_levels = self.source.settings.max_neighbors, self.source.num_levels
-        return scan_memory(self.scan.num_points, k=k, num_levels=num_levels)
+        num_points, on_disk = self.scan.num_points, self.on_disk
+        return scan_memory(num_points, k=k, num_levels=num_levels, on_disk=on_disk)
+
+    def within(self, limit: int) -> "Job":
+        """Return the job for a memory limit in bytes: on disk if it exceeds it, except images."""
+        is_large = self.memory > limit and self.source.settings.max_neighbors > 0
+        return replace(self, on_disk=is_large)
 
     @property
     def folder(self) -> Path:
@@ -208,7 +217,9 @@ def _convert(job: Job, begin: Begin) -> TaskReport:
         description |= {key: earlier[key] for key in earlier.keys() & {"pages"}}
     job.clean()
     provenance.write_record(folder, description | {"claims": provenance.owned_files(earlier)})
-    report = job.source.convert(job.scan, folder, begin)
+    storage = scratch.on_disk(os.environ.get("TMPDIR") or folder)
+    with storage if job.on_disk else contextlib.nullcontext():
+        report = job.source.convert(job.scan, folder, begin)
     if table is not None:
         provenance.write_record(
             folder, provenance.claim_files(provenance.read_record(folder) or description, [table])

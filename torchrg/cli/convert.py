@@ -76,7 +76,8 @@ class Arguments:
     for this command (ray), that of this machine (auto), or the address of one, as HOST:PORT, where
     ROOT and OUT have the same paths on every node."""
     limit_memory: float | None = None
-    """Memory limit for all concurrent scans, in GB. Default: 80 % of the free memory."""
+    """Memory limit for all concurrent scans, in GB; the largest arrays of a larger scan go to disk
+    (TMPDIR or OUT). Default: 80 % of the free memory."""
     table: str | None = None
     """Name of a plane table in the folder of each scan, besides planes.json, such as planes.csv;
     see torchrg segment --table."""
@@ -349,7 +350,9 @@ def _page_folder(arguments: Arguments) -> Path | None:
 
 
 def _plan_with_bar(jobs: list[Job], arguments: Arguments) -> Plan:
-    """Make the plan, with a progress bar."""
+    """Make the plan within the memory limit, with a progress bar."""
+    limit = _memory_limit(arguments)
+    jobs = [job.within(limit) for job in jobs]
     with tqdm(total=len(jobs), desc="looking", unit="scan", leave=False, disable=None) as bar:
         return make_plan(jobs, force=arguments.force, threads=num_cores(), on_scan=bar.update)
 
@@ -380,6 +383,8 @@ def _convert(plan: Plan, scans: list[Job], arguments: Arguments) -> int:
     """Convert the scans of a plan, print a report, and return the exit code."""
     out = scans[0].out
     jobs, workers, limit = plan.to_convert, arguments.workers, _memory_limit(arguments)
+    if num_large := sum(job.on_disk for job in jobs):
+        ending.print_lines(f"{num_large:,} scans exceed the limit: their largest arrays go to disk")
     for job in jobs:
         if job.memory > limit:
             ending.warn(
