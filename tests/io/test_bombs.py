@@ -71,7 +71,7 @@ def test_missing_memory_is_not_told_as_damage(tmp_path, monkeypatch):
     def refuse(*_, **__):
         raise MemoryError("Unable to allocate 9 TB")
 
-    monkeypatch.setattr("torchrg.io.npy.npy_format.read_array", refuse)
+    monkeypatch.setattr("torchrg.io.npy.scratch.empty", refuse)
     with pytest.raises(FormatError, match=r"a\.npz: 'points\.npy': out of memory; use a machine"):
         read_cloud(tmp_path / "a.npz")
 

@@ -2,6 +2,7 @@
 
 import json
 import re
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -9,9 +10,20 @@ import pytest
 import torch
 
 import torchrg.io
+from torchrg import scratch
 from tests.io.conftest import needs
 from torchrg.errors import FormatError, ShapeError
-from torchrg.io import FORMATS, RESULT_FIELDS, check_output, read_cloud, write_cloud
+from torchrg.io import (
+    FORMATS,
+    RESULT_FIELDS,
+    check_output,
+    files,
+    las,
+    npy,
+    read_cloud,
+    text,
+    write_cloud,
+)
 from torchrg.io.fields import describe_renamed_fields
 from torchrg.structures import Cloud, PlaneAdjacency, Superpoints
 
@@ -352,3 +364,54 @@ def test_names_that_no_file_can_hold_are_refused(tmp_path, kind, name):
     cloud = Cloud(np.zeros((2, 3)), {name: np.zeros(2)})
     with pytest.raises(FormatError, match=r"expected field names without NUL .*; rename the fie"):
         write_cloud(tmp_path / f"a{kind}", cloud)
+
+
+def owns(values):
+    """Return whether an array is a view of no file, no buffer and no larger array."""
+    owner = values
+    while isinstance(owner.base, np.ndarray):
+        owner = owner.base
+    return owner.base is None and owner.nbytes == values.nbytes and values.flags.writeable
+
+
+@pytest.mark.parametrize("num_points", [1, 12])
+def test_no_array_of_a_cloud_is_a_view_of_its_file(tmp_path, make_cloud, suffix, num_points):
+    write_cloud(tmp_path / f"a{suffix}", make_cloud(num_points=num_points))
+    cloud = read_cloud(tmp_path / f"a{suffix}")
+    assert all(map(owns, [cloud.coordinates, *cloud.fields.values()]))
+
+
+def test_a_file_of_columns_is_no_part_of_the_cloud(tmp_path):
+    table = np.asfortranarray(np.arange(40.0).reshape(10, 4))
+    np.save(tmp_path / "a.npy", table)
+    cloud = read_cloud(tmp_path / "a.npy", columns=("x", "y", "z", "quality"))
+    np.save(tmp_path / "a.npy", table[:1])  # In place: a map of the file would end the process.
+    assert cloud.fields["quality"].tolist() == table[:, 3].tolist()
+    np.savez(tmp_path / "b.npz", points=np.asfortranarray(table[:, :3]))
+    assert read_cloud(tmp_path / "b.npz").coordinates.tolist() == table[:, :3].tolist()
+
+
+@pytest.mark.parametrize("kind", [*EXACT, ".xyz", *GRID])
+def test_reading_to_disk_takes_little_memory(tmp_path, monkeypatch, kind):
+    needs(kind)
+    num_points = 40_000
+    for module, name, number in (
+        (las, "_POINTS_PER_CHUNK", 2000),
+        (text, "CHARACTERS_PER_READ", 2**15),
+        (files, "BYTES_PER_READ", 2**15),
+        (npy, "BYTES_PER_READ", 2**15),
+        (scratch, "_MIN_BYTES", 1),
+    ):
+        monkeypatch.setattr(module, name, number)
+    rng = np.random.default_rng(0)
+    fields = {f"field{i}": rng.random(num_points) for i in range(6)}
+    write_cloud(tmp_path / f"a{kind}", Cloud(rng.random((num_points, 3)), fields))
+    with scratch.on_disk(tmp_path):
+        read_cloud(tmp_path / f"a{kind}")  # The parser is loaded.
+        tracemalloc.start()
+        cloud = read_cloud(tmp_path / f"a{kind}")
+        _, most = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+    # Nine columns take 72 bytes.
+    assert most < 30 * num_points
+    assert cloud.fields.keys() == fields.keys()

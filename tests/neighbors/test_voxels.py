@@ -3,9 +3,11 @@
 from itertools import permutations
 
 import numpy as np
+import pytest
 import torch
 
-from torchrg.neighbors import sample_voxels
+from torchrg.batch.sites import count_sites
+from torchrg.neighbors import sample_voxels, voxels
 
 
 def voxels_by_loop(points, size):
@@ -30,6 +32,22 @@ def test_voxels_are_those_of_a_loop_over_points(rng):
     expected_rows, expected_inverse = voxels_by_loop(points.numpy(), 0.5)
     assert rows.tolist() == expected_rows
     assert inverse.tolist() == expected_inverse
+
+
+@pytest.mark.parametrize("kind", [torch.float32, torch.float64])
+@pytest.mark.parametrize("size", [0.05, 0.5])
+def test_voxels_found_in_slabs_are_those_of_the_whole_cloud(rng, monkeypatch, kind, size):
+    points = (torch.rand(3000, 3, generator=rng) * torch.tensor([1, 4, 2])).to(kind)
+    points[::5] = (points[::5] * 4).round() / 4  # Duplicates, and points at equal distances.
+    points[::7], points[3::50, 1] = torch.nan, torch.inf
+    whole, given = sample_voxels(points, size), points.clone()
+    for num_points in (1000, 7, 1):
+        monkeypatch.setattr(voxels, "_POINTS_AT_ONCE", num_points)
+        parts = sample_voxels(points, size)
+        assert torch.equal(parts.rows, whole.rows)
+        assert torch.equal(parts.inverse, whole.inverse)
+        assert count_sites(points, size) == len(whole.rows)
+    assert torch.equal(points.nan_to_num(), given.nan_to_num())
 
 
 def test_more_cells_than_whole_numbers_count_are_told_apart():

@@ -5,12 +5,10 @@ import math
 import torch
 from torch import Tensor
 
-_MAX_CELLS = 2**21
-"""Number of cells along an axis after which their numbers repeat: three of them fit into int64."""
+from torchrg.neighbors.voxels import cell_keys, split_voxels
+
 _HALF = 1.594
 """Mean number of points per voxel at which half of them are left."""
-_POINTS_AT_ONCE = 2**20
-"""Number of points whose voxels are found at a time."""
 
 
 def count_sites(points: Tensor, size: float) -> int:
@@ -20,12 +18,8 @@ def count_sites(points: Tensor, size: float) -> int:
         >>> count_sites(torch.tensor([[0.0, 0, 0], [0.04, 0, 0], [0.11, 0, 0]]), 0.1)
         2
     """
-    low, parts = torch.where(points.isfinite(), points, torch.inf).amin(dim=0), []
-    for part in torch.split(points, _POINTS_AT_ONCE):
-        cells = (part[part.isfinite().all(dim=1)].double() - low).div(size).floor().long()
-        x, y, z = cells.remainder(_MAX_CELLS).unbind(dim=1)
-        parts.append(torch.unique((x * _MAX_CELLS + y) * _MAX_CELLS + z))
-    return len(torch.unique(torch.cat(parts)))
+    parts = split_voxels(points, size)
+    return sum(len(torch.unique(cell_keys(cells))) for _, cells, _ in parts)
 
 
 def propose_voxel(points: Tensor) -> float:
@@ -34,7 +28,8 @@ def propose_voxel(points: Tensor) -> float:
     Points of one density have a Poisson distribution over the voxels of a surface: with a mean of m
     points, the fraction ``(1 - exp(-m)) / m`` is left.
     """
-    finite = points[points.isfinite().all(dim=1)]
+    is_finite = points.isfinite().all(dim=1)
+    finite = points if bool(is_finite.all()) else points[is_finite]
     extent = float((finite.amax(dim=0) - finite.amin(dim=0)).max())
     size = 2 * extent / math.sqrt(len(finite))
     fraction, mean = count_sites(finite, size or 1.0) / len(finite), 1.0

@@ -33,6 +33,8 @@ from torchrg.structures.colors import WIDEN, read_colors
 from torchrg.structures.points import Array, bounding_box
 
 _AXES = ("cartesianX", "cartesianY", "cartesianZ")
+_COORDINATES = "cartesianX"
+"""Column of the coordinates in all three axes; no field of a scan keeps this name."""
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 _STATES = ("cartesianInvalidState", "sphericalInvalidState")
 _CHANNELS = {"colorRed": "red", "colorGreen": "green", "colorBlue": "blue"}
@@ -126,9 +128,9 @@ def read_e57(path: Path, size: int) -> Cloud:
             points, fields = _read_points(path, pye57, file, header)
             # pye57 transforms the bounds of a scan that has a pose, contrary to the standard.
             bounds = () if scan.is_moved else _read_numbers(header.node, "cartesianBounds", _BOUNDS)
-            if bounds and len(finite := points[np.isfinite(points).all(axis=1)]):
+            if bounds:
                 box = np.reshape(bounds, (2, 3))
-                num_outside += distance_outside(*bounding_box(finite), box) > 0
+                num_outside += distance_outside(*_finite_box(points), box) > 0
             blocks.append(_to_world(points, fields, scan))
         notes = _unify_colors(path, blocks, [_color_limits(pye57, header) for header in headers])
         root = file.root
@@ -153,7 +155,7 @@ def read_e57(path: Path, size: int) -> Cloud:
     if num_images:
         notes += (f"images left out: {num_images}",)
     columns = {
-        name: np.concatenate(
+        name: scratch.join(
             [block.pop(name, np.zeros(n, "u1")) for block, n in zip(blocks, counts, strict=True)]
         )
         for name in names
@@ -161,7 +163,7 @@ def read_e57(path: Path, size: int) -> Cloud:
     if len(scans) > 1:
         columns["scan"] = np.repeat(np.arange(len(scans), dtype=np.int32), counts)
     header = {"scans": scans} | ({SYSTEM: system} if system else {})
-    cloud = assemble_cloud(path, columns, header=header, notes=notes)
+    cloud = assemble_cloud(path, columns, coordinates=_COORDINATES, header=header, notes=notes)
     front, more = _scanner_directions(scans, counts, cloud)
     return replace(cloud, front=front, notes=notes + more)
 
@@ -364,7 +366,10 @@ def _read_points(path: Path, pye57: ModuleType, file: Any, header: Any) -> tuple
 
 
 def _to_world(points: Array, block: _Block, scan: ScanPose) -> _Block:
-    """Apply the pose to points and normals of a scan, and rename its fields to column names."""
+    """Apply the pose to points and normals of a scan, and rename its fields to column names.
+
+    The points are one column, ``_COORDINATES``.
+    """
     if scan.is_moved and all(name in block for name in _NORMALS):
         normals = np.stack([block[name] for name in _NORMALS], axis=1)
         block.update(zip(_NORMALS, scan.turn(normals).astype(normals.dtype).T, strict=True))
@@ -372,7 +377,18 @@ def _to_world(points: Array, block: _Block, scan: ScanPose) -> _Block:
     short = {name: _CHANNELS.get(name, name.rpartition(":")[2]) for name in block}
     counts = Counter(short.values())
     named = {short[name] if counts[short[name]] == 1 else name: c for name, c in block.items()}
-    return {**named, **dict(zip("xyz", scan.to_world(points).T, strict=True))}
+    return {**named, _COORDINATES: scan.to_world(points)}
+
+
+def _finite_box(points: Array) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the minimum and maximum of the finite points ``(N, 3)``; inf and -inf without any."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for rows in split_rows(len(points), ROWS_AT_ONCE):
+        finite = points[rows][np.isfinite(points[rows]).all(axis=1)]
+        if len(finite):
+            ends = bounding_box(finite)
+            low, high = np.minimum(low, ends[0]), np.maximum(high, ends[1])
+    return low, high
 
 
 def to_cartesian(spherical: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -244,10 +244,13 @@ def _find_numbered(columns: NamedColumns) -> dict[str, list[str]]:
 
 
 def stack_columns(path: Path, columns: list[Array]) -> Array:
-    """Stack single columns, or return one column as it is, in native byte order."""
+    """Stack single columns, or return one column, in native byte order.
+
+    The result owns its memory: it is no view of a file or of the buffer of a parser.
+    """
     if len(columns) == 1:
         native = columns[0].dtype.newbyteorder("=")
-        return scratch.store(np.ascontiguousarray(columns[0], dtype=native))
+        return scratch.own(np.ascontiguousarray(columns[0], dtype=native))
     try:
         dtype = np.result_type(*columns)
     except TypeError as error:

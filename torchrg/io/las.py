@@ -8,13 +8,14 @@ Extra dimensions of the input keep name, type, scale, offset, no-data value and 
 import copy
 import math
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from torchrg import scratch
 from torchrg._optional import require
@@ -43,6 +44,8 @@ _BACKUP_NAMES = {
     _FIELD_NAMES.curvature: "curvature_input",
 }
 """Backup names of columns that a result replaces, if they are not the name plus ``_input``."""
+_STEPS = "X"
+"""Column of the coordinates in all three axes; no other dimension has this name."""
 _POINTS_PER_CHUNK = 1 << 20
 """Points read or written together. They take tens of megabytes."""
 _COLOR_FORMATS = {0: 2, 1: 3, 4: 5, 6: 7, 9: 10}
@@ -97,6 +100,7 @@ def read_las(path: Path, size: int) -> Cloud:
     for records in (header.vlrs, header.evlrs or []):
         records[:] = [r for r in records if r.user_id not in ("laszip encoded", "copc")]
     standard = set(header.point_format.standard_dimension_names)
+    coordinates = _join_coordinates([chunk.pop(_STEPS) for chunk in parts], header)
     names = list(parts[0])
     unused = {n for n in names if n in standard and not any(chunk[n].any() for chunk in parts)}
     if not unused.issuperset(_FIELD_NAMES.color):
@@ -105,21 +109,32 @@ def read_las(path: Path, size: int) -> Cloud:
     wide = {dim.name for dim in extra if dim.description == _WIDE_DESCRIPTION}
     columns = {
         # Popped from the parts, so that a column is not stored twice for long.
-        name.removesuffix(_WIDE_SUFFIX) if name in wide else name: scratch.store(
-            np.concatenate([chunk.pop(name) for chunk in parts])
+        name.removesuffix(_WIDE_SUFFIX) if name in wide else name: scratch.join(
+            [chunk.pop(name) for chunk in parts]
         )
         for name in names
         if name not in unused
     }
-    notes = _header_notes(header, columns, size)
-    return assemble_cloud(path, columns, header={"las": header}, notes=notes)
+    notes = _header_notes(header, coordinates, size)
+    columns[_STEPS] = coordinates
+    return assemble_cloud(path, columns, coordinates=_STEPS, header={"las": header}, notes=notes)
 
 
-def _header_notes(header: Any, columns: NamedColumns, size: int) -> tuple[str, ...]:  # noqa: ANN401
+def _join_coordinates(parts: Sequence[NDArray[np.int32]], header: Any) -> NDArray[np.float64]:  # noqa: ANN401
+    """Return the coordinates ``(N, 3)`` of chunks of integer steps ``(n, 3)``."""
+    coordinates, start = scratch.empty((sum(map(len, parts)), 3), np.float64), 0
+    for steps in parts:
+        rows = coordinates[start : start + len(steps)]
+        np.multiply(steps, header.scales, out=rows)
+        rows += header.offsets
+        start += len(steps)
+    return coordinates
+
+
+def _header_notes(header: Any, coordinates: Array, size: int) -> tuple[str, ...]:  # noqa: ANN401
     """Return notes on contradictions between a header and its points."""
-    notes = list[str]()
-    low, high = ([end(columns[axis]) for axis in "xyz"] for end in (np.min, np.max))
-    distance = distance_outside(low, high, [header.mins, header.maxs], header.scales)
+    notes, box = list[str](), [header.mins, header.maxs]
+    distance = distance_outside(*bounding_box(coordinates), box, header.scales)
     if distance:
         notes.append(
             f"its points lie up to {distance:.3g} outside the box in its header; check its scales, "
@@ -429,20 +444,23 @@ def _check_layers(path: Path, stream: BinaryIO, header: Any, chunks: list[int]) 
 
 
 def _chunk_columns(block: Any) -> dict[str, Array]:  # noqa: ANN401
-    """Return the columns of a chunk of points."""
-    columns = {axis: np.asarray(block[axis]) for axis in "xyz"}
+    """Return the columns of a chunk of points, and its coordinates in steps of the scale."""
+    steps = np.stack([block[axis] for axis in "XYZ"], axis=1)
+    columns: dict[str, Array] = {_STEPS: scratch.store(steps)}
     for dimension in block.point_format.dimensions:
-        values = np.asarray(block[dimension.name])
-        if dimension.name in ("X", "Y", "Z"):
+        if dimension.name.upper() in ("X", "Y", "Z"):
             continue
+        values = np.asarray(block[dimension.name])
         parts = [values] if values.ndim == 1 else values.T
         columns |= dict(zip(_column_names(dimension), map(_compact, parts), strict=True))
     return columns
 
 
 def _compact(values: Array) -> Array:
-    """Return a copy that does not keep the packed points, and takes no memory if all are zero."""
-    return values.copy() if values.any() else np.broadcast_to(values.dtype.type(0), values.shape)
+    """Return values that do not keep the packed points, and take no memory if all are zero."""
+    return (
+        scratch.own(values) if values.any() else np.broadcast_to(values.dtype.type(0), values.shape)
+    )
 
 
 def _dimension_holds(dimension: Any, column: Array) -> bool:  # noqa: ANN401

@@ -13,7 +13,6 @@ from torchrg.io.e57 import SYSTEM
 from torchrg.io.headers import MAX_INTEGER
 from torchrg.io.pcd import DEFAULT_VIEWPOINT
 from torchrg.structures import Cloud
-from torchrg.structures.points import Array
 
 _SUSPICIOUS_RATIO = 100
 """Ratio of the extents of two clouds from which a warning is issued: tiles of one survey differ
@@ -61,18 +60,15 @@ def merge_clouds(clouds: Sequence[Cloud]) -> Cloud:
     notes += [f"{name} is used {count} times" for name, count in times.items() if count > 1]
     notes += _note_sizes(clouds)
 
-    def join(parts: Sequence[Array]) -> Array:
-        return scratch.store(np.concatenate(parts))
-
     fronts = [np.zeros((len(c), 3), np.float32) if c.front is None else c.front for c in clouds]
     has_front = any(cloud.front is not None for cloud in clouds)
     return Cloud(
-        join([cloud.coordinates for cloud in clouds]),
-        {name: join([cloud.fields[name] for cloud in clouds]) for name in shared},
+        scratch.join([cloud.coordinates for cloud in clouds]),
+        {name: scratch.join([cloud.fields[name] for cloud in clouds]) for name in shared},
         source=f"{clouds[0].source} and {len(clouds) - 1} more",
         header=header,
         notes=tuple(notes),
-        front=join(fronts) if has_front else None,
+        front=scratch.join(fronts) if has_front else None,
     )
 
 

@@ -77,7 +77,7 @@ def read_npy(path: Path, size: int, columns: Sequence[str] | None = None) -> Clo
                 f"{path}: column names apply to unstructured arrays only; this array has fields "
                 f"{', '.join(dtype.names)}. Omit the names."
             )
-        records = np.load(path, allow_pickle=False).reshape(-1)
+        records = map_array(path).reshape(-1)
         return assemble_cloud(path, {name: records[name] for name in records.dtype.names})
     if len(shape) != 2 or shape[1] < 3:
         raise FormatError(f"{path}: expected shape (N, 3) or wider, got {shape}; reshape it.")
@@ -89,7 +89,7 @@ def read_npy(path: Path, size: int, columns: Sequence[str] | None = None) -> Clo
         )
     if columns is not None:
         check_names(path, columns, shape[1])
-    return assemble_table(path, np.load(path, allow_pickle=False), columns)
+    return assemble_table(path, map_array(path), columns)
 
 
 def count_npy(path: Path, size: int) -> int:
@@ -292,10 +292,22 @@ def _read_member(path: Path, archive: zipfile.ZipFile, name: str) -> Array:
         wrap_errors(f"{path}: {member!r}: ", *ARCHIVE_ERRORS, repair=_REPAIR),
         archive.open(member) as stream,
     ):
-        values: Array = npy_format.read_array(stream, allow_pickle=False)
-        while stream.read(BYTES_PER_READ):
-            pass
-        return scratch.store(values)
+        shape, is_fortran, dtype = _read_header(stream)
+        values = scratch.empty(shape[::-1] if is_fortran else shape, dtype)
+        memory, filled = memoryview(values.reshape(-1).view(np.uint8)), 0
+        while part := stream.read(BYTES_PER_READ):
+            memory[filled : filled + len(part)] = part
+            filled += len(part)
+        if filled < len(memory):
+            raise EOFError(f"{filled:,} of {len(memory):,} bytes")
+        return values.T if is_fortran else values
+
+
+def _read_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Read the header of an array: shape, whether it is in Fortran order, and type."""
+    is_old = npy_format.read_magic(stream) == (1, 0)
+    read = npy_format.read_array_header_1_0 if is_old else npy_format.read_array_header_2_0
+    return read(stream)
 
 
 def _check_npy(path: Path, size: int) -> _Layout:
@@ -310,9 +322,7 @@ def _check_array(path: Path, stream: IO[bytes], size: int, content: str) -> _Lay
     repair = "; write it again with numpy.save or numpy.savez"
     with wrap_errors(message, *PARSE_ERRORS, repair=repair):
         head = io.BytesIO(stream.read(_MAX_HEADER_BYTES))
-        is_old = npy_format.read_magic(head) == (1, 0)
-        read = npy_format.read_array_header_1_0 if is_old else npy_format.read_array_header_2_0
-        shape, _, dtype = read(head)
+        shape, _, dtype = _read_header(head)
     if dtype.hasobject:
         raise FormatError(
             f"{path}: {content} contains pickled Python objects, which are not loaded for security "

@@ -16,7 +16,14 @@ import numpy as np
 from torchrg.errors import FormatError
 from torchrg.io.columns import FieldNames, flatten_cloud, write_records
 from torchrg.io.fields import NamedColumns, assemble_cloud
-from torchrg.io.files import check_available, check_end, header_lines, open_lines, parse_count
+from torchrg.io.files import (
+    check_available,
+    check_end,
+    header_lines,
+    map_records,
+    open_lines,
+    parse_count,
+)
 from torchrg.io.text import read_rows
 from torchrg.structures import FARTHEST, Cloud
 from torchrg.structures.points import Array
@@ -237,7 +244,7 @@ def _read_binary(path: Path, stream: BinaryIO, header: _Header, size: int) -> Ar
     num_bytes, content = header.num_points * header.dtype.itemsize, f"{header.num_points:,} points"
     start = stream.tell()
     check_available(path, start, num_bytes, content, available=size - start)
-    return np.fromfile(stream, header.dtype, count=header.num_points)
+    return map_records(stream, header.dtype, header.num_points)
 
 
 def _read_compressed(path: Path, stream: BinaryIO, header: _Header, size: int) -> dict[str, Array]:

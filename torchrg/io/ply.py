@@ -15,6 +15,7 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrg import scratch
 from torchrg.errors import FormatError
 from torchrg.io.columns import (
     FieldNames,
@@ -24,7 +25,14 @@ from torchrg.io.columns import (
     write_records,
 )
 from torchrg.io.fields import MAX_EXACT_INTEGER, assemble_cloud
-from torchrg.io.files import check_available, check_end, header_lines, open_lines, parse_count
+from torchrg.io.files import (
+    check_available,
+    check_end,
+    header_lines,
+    map_records,
+    open_lines,
+    parse_count,
+)
 from torchrg.io.mesh import Fronts, find_fronts
 from torchrg.io.text import read_rows, skip_lines
 from torchrg.structures import Cloud
@@ -232,7 +240,7 @@ def _read_vertices(
         dtype = np.dtype([(prop.name, order + prop.code) for prop in vertex.properties])
         rows: Array
         if order:
-            rows = np.fromfile(stream, dtype, count)
+            rows = map_records(stream, dtype, count)
         else:
             rows = read_rows(path, stream, dtype, count, "vertices", line_number=line_number)
         return {name: rows[name] for name in dtype.names or ()}, []
@@ -246,7 +254,7 @@ def _read_vertices(
                 if len(shapes) > 1 or shapes == {(0,)}:
                     del parts[prop.name]
     uneven = [prop.name for prop in vertex.properties if prop.name not in parts]
-    return {name: np.concatenate(known or [np.empty(0)]) for name, known in parts.items()}, uneven
+    return {name: scratch.join(known or [np.empty(0)]) for name, known in parts.items()}, uneven
 
 
 def _seek_element(path: Path, stream: BinaryIO, header: _Header, index: int, size: int) -> int:

@@ -20,6 +20,7 @@ from typing import Any, BinaryIO, NamedTuple, TextIO
 
 import numpy as np
 
+from torchrg import scratch
 from torchrg._parallel import split_rows
 from torchrg.errors import FormatError, warn
 from torchrg.io.arrow import parse_numbers
@@ -69,7 +70,7 @@ def read_text(path: Path, size: int, columns: Sequence[str] | None = None) -> Cl
     # Decoding errors matter only in column names.
     with path.open(encoding=find_encoding(path), errors="replace") as stream:
         preamble = _read_preamble(path, map(_standardize, stream), columns)
-        table = np.concatenate(list(_parse_blocks(path, stream, preamble)))
+        table = scratch.join([*map(scratch.store, _parse_blocks(path, stream, preamble))])
     num_points = sum(preamble.counts)
     if len(table) < num_points:
         raise FormatError(
@@ -125,7 +126,7 @@ def read_rows(
     content = f"{num_rows:,} {content}"
     check_available(path, start, min_bytes, content, available=available, at_least=True)
     lines = (_standardize(raw.decode("latin-1")) for raw in stream)
-    parts, count = [np.empty(0, dtype)], 0
+    rows, count = scratch.empty((num_rows,), dtype), 0
     while count < num_rows:
         block = list(islice(lines, min(LINES_PER_CHUNK, num_rows - count)))
         if not block:
@@ -133,10 +134,11 @@ def read_rows(
                 f"{path}: line {line_number}: expected {num_rows:,} rows of numbers, got "
                 f"{count:,}; the file is truncated or its header is wrong, write or copy it again."
             )
-        parts.append(_parse(path, block, dtype, line_number))
-        count += len(parts[-1])
+        parsed = _parse(path, block, dtype, line_number)
+        rows[count : count + len(parsed)] = parsed
+        count += len(parsed)
         line_number += len(block)
-    return np.concatenate(parts)
+    return rows
 
 
 def _standardize(text: str) -> str:

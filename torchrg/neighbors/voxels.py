@@ -1,6 +1,6 @@
 """Voxel sampling with the inverse map to all points."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchrg import scratch
 from torchrg._checks import as_tensor, check_points, is_positive
+from torchrg._parallel import ROWS_AT_ONCE, nonzero_rows, split_rows
 from torchrg.errors import CloudWarning, ConfigError, shown, warn
 from torchrg.neighbors.order import mark_distinct
 from torchrg.structures import UNLABELED, AnyCloud
@@ -18,6 +19,10 @@ _MAX_VOXELS = 2**53
 """Maximum number of voxels along one axis: float64 counts no further."""
 _MIN_VOXELS = 3
 """Minimum number of voxels with a plane."""
+_POINTS_AT_ONCE = 2**19
+"""Number of points whose voxels are found at a time, in 60 MB."""
+_SAMPLE_SIZE = 10_000
+"""Number of points from which the borders of slabs with as many points are found."""
 _MAX_KEYS = 2**62
 """Maximum number of cells with distinct int64 keys; above the squared number of points."""
 
@@ -54,34 +59,73 @@ def sample_voxels(points: AnyCloud, size: float) -> Voxels:
     check_points("sample_voxels", tensor)
     if not is_positive(size):
         raise ConfigError(f"sample_voxels: expected size > 0, got {shown(size)}.")
-    inverse = torch.full((len(tensor),), UNLABELED, device=tensor.device)
-    finite = tensor.isfinite().all(dim=-1).nonzero().squeeze(-1)
-    if len(finite) == 0:
-        return Voxels(finite, inverse)
-    columns, cells = tensor.detach().unbind(dim=-1), list[Tensor]()
-    sq_distance = tensor.new_zeros((), dtype=torch.float64)
-    for column in columns:
-        scaled = column[finite].double()
-        scaled = scaled.sub_(scaled.min()).div_(size)
-        cell = scaled.floor()
-        sq_distance = scratch.store(scaled.sub_(cell).sub_(0.5).square_().add_(sq_distance))
-        cells.append(scratch.store(cell))
-    if max(float(cell.max()) for cell in cells) >= _MAX_VOXELS:
+    like = torch.empty(0, dtype=torch.int64, device=tensor.device)
+    inverse = scratch.new_empty(like, tensor.shape[:1]).fill_(UNLABELED)
+    chosen = [like]
+    for rows, cells, sq_distance in split_voxels(tensor.detach(), size):
+        sample, voxel = _choose_points(tensor.detach()[rows], cells, sq_distance)
+        chosen.append(rows[sample])
+        inverse[rows] = chosen[-1][voxel]
+    rows = torch.cat(chosen).sort().values
+    ranks = scratch.new_empty(like, tensor.shape[:1])
+    ranks[rows] = torch.arange(len(rows), device=tensor.device)
+    for part in map(inverse.__getitem__, split_rows(len(inverse), ROWS_AT_ONCE)):
+        part.copy_(torch.where(part < 0, part, ranks[part]))
+    return Voxels(rows, inverse)
+
+
+def split_voxels(points: Tensor, size: float) -> Iterator[tuple[Tensor, list[Tensor], Tensor]]:
+    """Yield slabs of whole voxels across the longest axis of finite points ``(N, 3)``.
+
+    Yields:
+        rows: Rows of the points of a slab, ascending, shape ``(n,)``, int64.
+        cells: Their cells along each axis, whole numbers from 0, shape ``(n,)`` each, float64.
+        sq_distance: Squared distances to the centers of their cells, in cells, ``(n,)``, float64.
+    """
+    parts = split_rows(len(points), ROWS_AT_ONCE)
+    is_finite = torch.cat([points[:0, 0].bool(), *(points[p].isfinite().all(dim=1) for p in parts)])
+    ends = [points[part][is_finite[part]].aminmax(dim=0) for part in parts if is_finite[part].any()]
+    if not ends:
+        return
+    low, high = (torch.stack(bounds).double() for bounds in zip(*ends, strict=True))
+    low = low.amin(dim=0)
+    num_cells = (high.amax(dim=0) - low).div_(size).floor_()
+    if float(num_cells.max()) >= _MAX_VOXELS:
         raise ConfigError(
             f"sample_voxels: expected size to divide the extent of the cloud into fewer than 2^53 "
             f"cells, got {shown(size)}. Choose a larger size."
         )
-    keys, order = map(scratch.store, cell_keys(cells).sort(stable=True))
+    axis, num_slabs = int(num_cells.argmax()), -(-len(points) // _POINTS_AT_ONCE)
+    some = slice(None, None, -(-len(points) // _SAMPLE_SIZE))
+    ordered = points[some, axis][is_finite[some]].double().sort().values
+    borders = ordered[:: -(-len(ordered) // num_slabs) or 1][1:].sub(low[axis]).div_(size).floor_()
+    slab = torch.empty(len(points), dtype=torch.int16, device=points.device)
+    for part in parts:
+        cell = points[part, axis].double().sub(low[axis]).div_(size).floor_()
+        slab[part] = torch.searchsorted(borders, cell, right=True).where(is_finite[part], -1)
+    for number in range(num_slabs):
+        rows = nonzero_rows(slab == number)
+        cells, sq_distance = list[Tensor](), points.new_zeros((), dtype=torch.float64)
+        for column, lowest in zip(points[rows].unbind(dim=1), low, strict=True):
+            scaled = column.double().sub(lowest).div_(size)
+            cells.append(scaled.floor())
+            sq_distance = scaled.sub_(cells[-1]).sub_(0.5).square_().add_(sq_distance)
+        if len(rows):
+            yield rows, cells, sq_distance
+
+
+def _choose_points(
+    points: Tensor, cells: Sequence[Tensor], sq_distance: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return the row of the point that represents each voxel, and the voxel of each point."""
+    keys, order = cell_keys(cells).sort(stable=True)
     voxel, counts = torch.unique_consecutive(keys, return_inverse=True, return_counts=True)[1:]
-    order, voxel, sq_distance = finite[order], scratch.store(voxel), sq_distance[order]
+    sq_distance = sq_distance[order]
     minimum = torch.segment_reduce(sq_distance, "min", lengths=counts)
     nearest = (sq_distance == minimum[voxel]).nonzero().squeeze(1)
     if len(nearest) > len(counts):
-        nearest = _first_by_coordinates(nearest, voxel, [c[order] for c in columns])
-    rows = order[nearest]
-    ranks = rows.argsort().argsort()
-    inverse[order] = ranks[voxel]
-    return Voxels(rows.sort().values, scratch.store(inverse))
+        nearest = _first_by_coordinates(nearest, voxel, points[order].unbind(dim=1))
+    return order[nearest], torch.empty_like(voxel).index_copy_(0, order, voxel)
 
 
 def warn_about_voxel(caller: str, size: float, num_voxels: int, num_points: int) -> None:

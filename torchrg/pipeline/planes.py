@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchrg import scratch
 from torchrg._checks import as_cloud, as_tensor, check_shapes, eager_only
-from torchrg._parallel import return_freed_memory
+from torchrg._parallel import ROWS_AT_ONCE, return_freed_memory, split_rows
 from torchrg.config import AnyConfig, PipelineConfig, settings_of
 from torchrg.errors import CloudWarning, ShapeError, warn
 from torchrg.neighbors import (
@@ -277,10 +277,12 @@ def _find_sites(distinct: DistinctPoints, voxel: float | None) -> _Sites:
         return _Sites(distinct.points, distinct.inverse)
     voxels = sample_voxels(distinct.points, voxel)
     order = canonical_order(distinct.points[voxels.rows])
-    site = scratch.store(order.argsort()[voxels.inverse])
-    site = scratch.store(distinct.restore(site, fill=UNLABELED))
+    site, inverse = order.argsort(), scratch.new_empty(distinct.inverse, distinct.inverse.shape)
+    for rows in split_rows(len(inverse), ROWS_AT_ONCE):
+        known = expand_to_points(voxels.inverse, distinct.inverse[rows], fill=UNLABELED)
+        inverse[rows] = expand_to_points(site, known, fill=UNLABELED)
     warn_about_voxel("segment_planes", voxel, len(order), len(distinct.points))
-    return _Sites(scratch.store(distinct.points[voxels.rows[order]]), site)
+    return _Sites(scratch.store(distinct.points[voxels.rows[order]]), inverse)
 
 
 class _Parts(NamedTuple):

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchrg._parallel import ROWS_AT_ONCE, split_rows
 from torchrg.errors import PrecisionWarning, UnitWarning, warn
 
 _COARSE, _COARSE_GRID = 0.1, 0.5
@@ -143,11 +144,14 @@ def _spacing(points: NDArray[np.floating], side: float) -> float:
     """
     from scipy.spatial import cKDTree
 
-    cells = np.floor(points.astype(np.float64) / side).clip(-(2.0**62), 2.0**62).astype(np.int64)
-    hashes = np.bitwise_xor.reduce(cells * _PRIMES, axis=1).view(np.uint64) * np.uint64(_MIXING)
-    fraction = min(_SAMPLE / len(points), 1.0)
-    chosen = points[hashes <= fraction * np.iinfo(np.uint64).max]
-    positions = np.unique(chosen.astype(np.float64), axis=0)
+    max_hash = min(_SAMPLE / len(points), 1.0) * np.iinfo(np.uint64).max
+    chosen = []
+    for rows in split_rows(len(points), ROWS_AT_ONCE):
+        part = points[rows].astype(np.float64)
+        cells = np.floor(part / side).clip(-(2.0**62), 2.0**62).astype(np.int64)
+        mixed = np.bitwise_xor.reduce(cells * _PRIMES, axis=1)
+        chosen.append(part[mixed.view(np.uint64) * np.uint64(_MIXING) <= max_hash])
+    positions = np.unique(np.concatenate(chosen), axis=0)
     if len(positions) < 2:
         return math.inf
     return float(np.median(cKDTree(positions).query(positions, k=2)[0][:, 1]))
