@@ -123,17 +123,14 @@ def new_empty(like: Tensor, shape: Sequence[int]) -> Tensor:
 
 
 def join(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Concatenate arrays, on disk if the result is large and active."""
+    """Concatenate arrays in native byte order, on disk if the result is large and active."""
     shape = (sum(map(len, parts)), *parts[0].shape[1:])
     return np.concatenate(parts, out=empty(shape, np.result_type(*(part.dtype for part in parts))))
 
 
 def store(values: Stored) -> Stored:
-    """Return a copy on disk of an array or tensor, in its layout.
-
-    Return the values themselves if they are small, on disk already, or arrays are not moved there.
-    """
-    if not is_active() or values.nbytes < _MIN_BYTES or _is_map(_owner(values)):
+    """Return a copy on disk of an array or tensor, in its layout; itself if small or not active."""
+    if not is_active() or values.nbytes < _MIN_BYTES:
         return values
     if isinstance(values, Tensor):
         return torch.from_numpy(store(values.numpy())) if values.device.type == "cpu" else values
@@ -142,28 +139,6 @@ def store(values: Stored) -> Stored:
     stored = empty(values.shape, values.dtype)
     stored[...] = values
     return stored
-
-
-def own(values: NDArray[Any]) -> NDArray[Any]:
-    """Return values, on disk if large and active; copy a view of a buffer or of a larger array."""
-    stored = store(values)
-    owner = _owner(stored)
-    is_whole = isinstance(owner, np.ndarray) and owner.nbytes == values.nbytes
-    return stored if is_whole or _is_map(owner) else stored.copy()
-
-
-def _owner(values: Tensor | NDArray[Any]) -> object:
-    """Return the object that holds the memory of an array."""
-    owner: object = values
-    while isinstance(owner, np.ndarray) and owner.base is not None:
-        owner = owner.base
-    return owner.obj if isinstance(owner, memoryview) else owner
-
-
-def _is_map(memory: object) -> bool:
-    """Return whether an object is the map of a scratch file."""
-    with _lock:
-        return isinstance(memory, mmap.mmap) and memory in _maps
 
 
 def _release_until(is_done: threading.Event) -> None:

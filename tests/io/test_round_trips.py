@@ -10,8 +10,8 @@ import pytest
 import torch
 
 import torchrg.io
-from torchrg import scratch
 from tests.io.conftest import needs
+from torchrg import scratch
 from torchrg.errors import FormatError, ShapeError
 from torchrg.io import (
     FORMATS,

@@ -2,7 +2,7 @@
 
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
@@ -151,3 +151,15 @@ def write_records(path: Path, header: Sequence[str], columns: NamedColumns) -> N
         stream.write("".join(f"{line}\n" for line in header).encode())
         for rows in split_rows(num_rows, _RECORDS_PER_CHUNK):
             to_records(columns, rows).tofile(stream)
+
+
+def map_records(stream: BinaryIO, dtype: np.dtype[Any], count: int) -> Array:
+    """Map records at the position of a stream, which moves to their end, shape ``(count,)``.
+
+    Unlike a buffer, pages of the file take no memory that the system cannot reclaim.
+    """
+    start = stream.tell()
+    # No records cannot be mapped.
+    records = np.memmap(stream, dtype, "c", start, count) if count else np.empty(0, dtype)
+    stream.seek(start + count * dtype.itemsize)
+    return np.asarray(records)

@@ -128,9 +128,9 @@ def read_e57(path: Path, size: int) -> Cloud:
             points, fields = _read_points(path, pye57, file, header)
             # pye57 transforms the bounds of a scan that has a pose, contrary to the standard.
             bounds = () if scan.is_moved else _read_numbers(header.node, "cartesianBounds", _BOUNDS)
-            if bounds:
+            if bounds and len(finite := points[np.isfinite(points).all(axis=1)]):
                 box = np.reshape(bounds, (2, 3))
-                num_outside += distance_outside(*_finite_box(points), box) > 0
+                num_outside += distance_outside(*bounding_box(finite), box) > 0
             blocks.append(_to_world(points, fields, scan))
         notes = _unify_colors(path, blocks, [_color_limits(pye57, header) for header in headers])
         root = file.root
@@ -378,17 +378,6 @@ def _to_world(points: Array, block: _Block, scan: ScanPose) -> _Block:
     counts = Counter(short.values())
     named = {short[name] if counts[short[name]] == 1 else name: c for name, c in block.items()}
     return {**named, _COORDINATES: scan.to_world(points)}
-
-
-def _finite_box(points: Array) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the minimum and maximum of the finite points ``(N, 3)``; inf and -inf without any."""
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for rows in split_rows(len(points), ROWS_AT_ONCE):
-        finite = points[rows][np.isfinite(points[rows]).all(axis=1)]
-        if len(finite):
-            ends = bounding_box(finite)
-            low, high = np.minimum(low, ends[0]), np.maximum(high, ends[1])
-    return low, high
 
 
 def to_cartesian(spherical: NDArray[np.float64]) -> NDArray[np.float64]:

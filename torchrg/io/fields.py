@@ -57,7 +57,8 @@ def assemble_cloud(
 ) -> Cloud:
     """Build a cloud from columns named as in the file.
 
-    ``coordinates`` is the column that holds ``x``, ``y`` and ``z``, if these are not columns.
+    ``coordinates`` is the column that holds ``x``, ``y`` and ``z``, if these are not columns. It is
+    not copied.
     ``integers`` are the columns stored as integers in the file, whatever their type here.
     """
     remaining = dict(columns)
@@ -75,7 +76,7 @@ def assemble_cloud(
             )
         values = stack_columns(path, axes)
     else:
-        values = stack_columns(path, [remaining.pop(coordinates)])
+        values = remaining.pop(coordinates)
     points = convert_coordinates(path, values)
     sources = _field_columns(remaining)
     fields = {
@@ -83,16 +84,16 @@ def assemble_cloud(
         for name, parts in sources.items()
     }
     if "labels" in fields:
-        fields["labels"] = _convert_labels(path, fields["labels"])
+        fields["labels"] = scratch.store(_convert_labels(path, fields["labels"]))
     if "normals" in fields:
-        fields["normals"] = _convert_normals(path, fields["normals"])
+        fields["normals"] = scratch.store(_convert_normals(path, fields["normals"]))
     if "color" in fields:
         color = fields["color"]
         if set(integers).issuperset(sources["color"]) and are_integers(color):
             color = color.astype(np.int64)
-        fields["color"], more = read_colors(path, color)
+        color, more = read_colors(path, color)
+        fields["color"] = scratch.store(color)
         notes += more
-    fields = {name: scratch.store(values) for name, values in fields.items()}
     return Cloud(points, fields, grid_shape, str(path), header or {}, notes)
 
 
@@ -244,13 +245,12 @@ def _find_numbered(columns: NamedColumns) -> dict[str, list[str]]:
 
 
 def stack_columns(path: Path, columns: list[Array]) -> Array:
-    """Stack single columns, or return one column, in native byte order.
+    """Stack single columns, or copy one, in native byte order.
 
-    The result owns its memory: it is no view of a file or of the buffer of a parser.
+    A view would keep the file or the buffer of a parser.
     """
     if len(columns) == 1:
-        native = columns[0].dtype.newbyteorder("=")
-        return scratch.own(np.ascontiguousarray(columns[0], dtype=native))
+        return scratch.join(columns)
     try:
         dtype = np.result_type(*columns)
     except TypeError as error:

@@ -19,9 +19,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
-import numpy as np
-from numpy.typing import NDArray
-
 from torchrg._limits import system_limit
 from torchrg.errors import FormatError
 from torchrg.structures.points import FilePath
@@ -321,18 +318,6 @@ def check_available(
             f"{path}: byte {byte}: expected {prefix}{needed:,} bytes for {content}, got "
             f"{available:,}; the file is truncated or its header is wrong, write or copy it again."
         )
-
-
-def map_records(stream: BinaryIO, dtype: np.dtype[Any], count: int) -> NDArray[Any]:
-    """Map records at the position of a stream, which moves to their end, shape ``(count,)``.
-
-    Unlike a buffer, pages of the file take no memory that the system cannot reclaim.
-    """
-    start = stream.tell()
-    # No records cannot be mapped.
-    records = np.memmap(stream, dtype, "c", start, count) if count else np.empty(0, dtype)
-    stream.seek(start + count * dtype.itemsize)
-    return np.asarray(records)
 
 
 def check_end(path: Path, stream: BinaryIO, record_bytes: int = 0) -> tuple[str, ...]:

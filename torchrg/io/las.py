@@ -457,10 +457,9 @@ def _chunk_columns(block: Any) -> dict[str, Array]:  # noqa: ANN401
 
 
 def _compact(values: Array) -> Array:
-    """Return values that do not keep the packed points, and take no memory if all are zero."""
-    return (
-        scratch.own(values) if values.any() else np.broadcast_to(values.dtype.type(0), values.shape)
-    )
+    """Return a copy that does not keep the packed points, and takes no memory if all are zero."""
+    zeros = np.broadcast_to(values.dtype.type(0), values.shape)
+    return scratch.join([values]) if values.any() else zeros
 
 
 def _dimension_holds(dimension: Any, column: Array) -> bool:  # noqa: ANN401

@@ -78,7 +78,7 @@ def read_npy(path: Path, size: int, columns: Sequence[str] | None = None) -> Clo
                 f"{', '.join(dtype.names)}. Omit the names."
             )
         records = map_array(path).reshape(-1)
-        return assemble_cloud(path, {name: records[name] for name in records.dtype.names})
+        return assemble_cloud(path, {name: records[name] for name in records.dtype.names or ()})
     if len(shape) != 2 or shape[1] < 3:
         raise FormatError(f"{path}: expected shape (N, 3) or wider, got {shape}; reshape it.")
     check_coordinates(path, (shape[0], 3), dtype)
@@ -294,7 +294,7 @@ def _read_member(path: Path, archive: zipfile.ZipFile, name: str) -> Array:
     ):
         shape, is_fortran, dtype = _read_header(stream)
         values = scratch.empty(shape[::-1] if is_fortran else shape, dtype)
-        memory, filled = memoryview(values.reshape(-1).view(np.uint8)), 0
+        memory, filled = values.reshape(-1).view(np.uint8).data, 0
         while part := stream.read(BYTES_PER_READ):
             memory[filled : filled + len(part)] = part
             filled += len(part)

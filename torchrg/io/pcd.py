@@ -14,16 +14,9 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 
 from torchrg.errors import FormatError
-from torchrg.io.columns import FieldNames, flatten_cloud, write_records
+from torchrg.io.columns import FieldNames, flatten_cloud, map_records, write_records
 from torchrg.io.fields import NamedColumns, assemble_cloud
-from torchrg.io.files import (
-    check_available,
-    check_end,
-    header_lines,
-    map_records,
-    open_lines,
-    parse_count,
-)
+from torchrg.io.files import check_available, check_end, header_lines, open_lines, parse_count
 from torchrg.io.text import read_rows
 from torchrg.structures import FARTHEST, Cloud
 from torchrg.structures.points import Array

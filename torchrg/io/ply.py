@@ -21,18 +21,12 @@ from torchrg.io.columns import (
     FieldNames,
     check_exact,
     flatten_cloud,
+    map_records,
     narrow_integers,
     write_records,
 )
 from torchrg.io.fields import MAX_EXACT_INTEGER, assemble_cloud
-from torchrg.io.files import (
-    check_available,
-    check_end,
-    header_lines,
-    map_records,
-    open_lines,
-    parse_count,
-)
+from torchrg.io.files import check_available, check_end, header_lines, open_lines, parse_count
 from torchrg.io.mesh import Fronts, find_fronts
 from torchrg.io.text import read_rows, skip_lines
 from torchrg.structures import Cloud
