@@ -1,11 +1,15 @@
 """E57: scans with poses, extensions, invalid points."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
+from torchrg import scratch
 from torchrg.errors import FormatError
 from torchrg.io import estimate_points, read_cloud
 from torchrg.io.e57 import ScanPose, to_cartesian
+from torchrg.structures import Cloud
 
 pye57 = pytest.importorskip("pye57")
 
@@ -322,3 +326,21 @@ def test_bounds_that_contradict_the_points_are_told(tmp_path):
         notes[name] = read_cloud(path).notes
     reported = "the points of 1 of 1 scans lie outside the bounds in the header; check the scales"
     assert notes == {"right": (), "wrong": (reported,)}
+
+
+def test_scans_read_to_disk_take_little_memory(tmp_path, write_scan, monkeypatch):
+    monkeypatch.setattr(scratch, "_MIN_BYTES", 1)
+    rng, num_points = np.random.default_rng(0), 40_000
+    color = {"color": rng.integers(0, 256, (num_points, 3)).astype(np.uint8)}
+    pose = {"rotation": QUARTER, "translation": np.array([500_000.0, 4_500_000.0, 0])}
+    cloud = Cloud(rng.random((num_points, 3)), color)
+    path = write_scan(tmp_path / "a.e57", cloud, **pose)
+    with scratch.on_disk(tmp_path):
+        read_cloud(path)  # The parser is loaded.
+        tracemalloc.start()
+        found = read_cloud(path)
+        _, most = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+    # Coordinates and colors take 27 bytes.
+    assert most < 20 * num_points
+    assert np.array_equal(found.fields["color"], cloud.fields["color"])

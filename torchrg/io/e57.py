@@ -203,7 +203,7 @@ def _unify_colors(
     colors = dict[int, Array]()
     for i, (block, stated) in enumerate(zip(blocks, limits, strict=True)):
         if all(channel in block for channel in channels):
-            color = np.stack([block[channel] for channel in channels], axis=1)
+            color = stack_columns(path, [block[channel] for channel in channels])
             colors[i], more = read_colors(path, color, stated)
             notes |= dict.fromkeys(more)
     is_wide = any(color.dtype == np.uint16 for color in colors.values())
@@ -223,8 +223,9 @@ def _scanner_directions(scans: Sequence[ScanPose], counts: Sequence[int], cloud:
     if not any(scan.is_moved for scan in scans) or not cloud.finite.any():
         return None, ()
     positions = np.array([scan.translation for scan in scans])
-    finite = cloud.coordinates[cloud.finite]
-    inside = ((finite.min(axis=0) <= positions) & (positions <= finite.max(axis=0))).all(axis=1)
+    is_whole = bool(cloud.finite.all())
+    low, high = bounding_box(cloud.coordinates if is_whole else cloud.coordinates[cloud.finite])
+    inside = ((low <= positions) & (positions <= high)).all(axis=1)
     notes: tuple[str, ...] = ()
     if not inside.all():
         notes = (
@@ -238,7 +239,7 @@ def _scanner_directions(scans: Sequence[ScanPose], counts: Sequence[int], cloud:
     parts = (np.split(values, np.cumsum(counts)[:-1]) for values in (front, cloud.coordinates))
     for position, is_inside, part, points in zip(positions, inside, *parts, strict=True):
         if is_inside:
-            part[:] = position - points
+            np.subtract(position, points, out=part, casting="same_kind")
     front[~cloud.finite] = 0
     return front, notes
 
