@@ -371,7 +371,7 @@ def owns(values):
     owner = values
     while isinstance(owner.base, np.ndarray):
         owner = owner.base
-    return owner.base is None and owner.nbytes == values.nbytes and values.flags.writeable
+    return owner.base is None and owner.nbytes == values.nbytes and values.flags["W"]
 
 
 @pytest.mark.parametrize("num_points", [1, 12])

@@ -22,7 +22,7 @@ _MIN_VOXELS = 3
 _POINTS_AT_ONCE = 2**19
 """Number of points whose voxels are found at a time, in 60 MB."""
 _SAMPLE_SIZE = 10_000
-"""Number of points from which the borders of slabs with as many points are found."""
+"""Number of points from which the borders of slabs of about equal size are found."""
 _MAX_KEYS = 2**62
 """Maximum number of cells with distinct int64 keys; above the squared number of points."""
 
@@ -79,7 +79,7 @@ def split_voxels(points: Tensor, size: float) -> Iterator[tuple[Tensor, list[Ten
 
     Yields:
         rows: Rows of the points of a slab, ascending, shape ``(n,)``, int64.
-        cells: Their cells along each axis, whole numbers from 0, shape ``(n,)`` each, float64.
+        cells: Their cells along each axis, integers from 0, shape ``(n,)`` each, float64.
         sq_distance: Squared distances to the centers of their cells, in cells, ``(n,)``, float64.
     """
     parts = split_rows(len(points), ROWS_AT_ONCE)
