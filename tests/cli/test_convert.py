@@ -68,6 +68,7 @@ def test_a_folder_holds_what_the_contract_says(rooms, converted):
 def test_one_worker_and_little_memory_give_the_same_bytes(rooms, converted, tmp_path, convert):
     done = convert("folder", rooms, tmp_path / "out", "--workers", 1, "--limit-memory", 0.1)
     assert done.err.count("may exceed the memory limit of 0.1 GB; it runs alone") == 2
+    assert "moving the largest arrays of 2 of 2 scans, which exceed the memory limit," in done.out
     assert results_of(tmp_path / "out") == results_of(converted)
 
 

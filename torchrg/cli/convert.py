@@ -384,7 +384,8 @@ def _convert(plan: Plan, scans: list[Job], arguments: Arguments) -> int:
     out = scans[0].out
     jobs, workers, limit = plan.to_convert, arguments.workers, _memory_limit(arguments)
     if num_large := sum(job.on_disk for job in jobs):
-        ending.print_lines(f"{num_large:,} scans exceed the limit: their largest arrays go to disk")
+        large = f"{num_large:,} of {len(jobs):,} scans, which exceed the memory limit,"
+        ending.print_lines(f"moving the largest arrays of {large} to disk")
     for job in jobs:
         if job.memory > limit:
             ending.warn(
