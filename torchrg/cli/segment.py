@@ -14,7 +14,7 @@ import torch
 
 from torchrg import scratch
 from torchrg.batch.memory import available_memory, scan_memory
-from torchrg.batch.sites import count_sites, propose_voxel
+from torchrg.batch.sites import propose_voxel
 from torchrg.cli import flags, loop
 from torchrg.cli.arguments import parse
 from torchrg.cli.ending import print_lines, warn
@@ -27,6 +27,7 @@ from torchrg.io.files import check_space
 from torchrg.io.merge import merge_clouds
 from torchrg.io.plane_table import TABLE_SUFFIXES, describe_planes
 from torchrg.io.result import Result, write_table
+from torchrg.neighbors import sample_voxels
 from torchrg.pipeline.clouds import (
     describe_multipliers,
     find_objects,
@@ -192,7 +193,7 @@ def _read(
     # The number was an estimate for text.
     storage.enter_context(_array_storage(arguments, source, target, len(cloud), limit))
     if arguments.voxel is not None:
-        num_sites = count_sites(cloud.points, arguments.voxel)
+        num_sites = len(sample_voxels(cloud.points, arguments.voxel).rows)
         print_lines(f"{source}: {num_sites:,} sites, one of the {len(cloud):,} points per voxel")
     elif scratch.is_active():
         voxel = propose_voxel(cloud.points)

@@ -62,7 +62,7 @@ def sample_voxels(points: AnyCloud, size: float) -> Voxels:
     like = torch.empty(0, dtype=torch.int64, device=tensor.device)
     inverse = scratch.new_empty(like, tensor.shape[:1]).fill_(UNLABELED)
     chosen = [like]
-    for rows, cells, sq_distance in split_voxels(tensor.detach(), size):
+    for rows, cells, sq_distance in _split_voxels(tensor.detach(), size):
         sample, voxel = _choose_points(tensor.detach()[rows], cells, sq_distance)
         chosen.append(rows[sample])
         inverse[rows] = chosen[-1][voxel]
@@ -74,7 +74,7 @@ def sample_voxels(points: AnyCloud, size: float) -> Voxels:
     return Voxels(rows, inverse)
 
 
-def split_voxels(points: Tensor, size: float) -> Iterator[tuple[Tensor, list[Tensor], Tensor]]:
+def _split_voxels(points: Tensor, size: float) -> Iterator[tuple[Tensor, list[Tensor], Tensor]]:
     """Yield slabs of whole voxels across the longest axis of finite points ``(N, 3)``.
 
     Yields:
