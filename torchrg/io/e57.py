@@ -225,7 +225,7 @@ def _scanner_directions(scans: Sequence[ScanPose], counts: Sequence[int], cloud:
     positions = np.array([scan.translation for scan in scans])
     is_whole = bool(cloud.finite.all())
     low, high = bounding_box(cloud.coordinates if is_whole else cloud.coordinates[cloud.finite])
-    inside = ((low <= positions) & (positions <= high)).all(axis=1)
+    inside = np.all([low <= positions, positions <= high], axis=(0, 2))
     notes: tuple[str, ...] = ()
     if not inside.all():
         notes = (

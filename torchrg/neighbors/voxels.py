@@ -19,8 +19,8 @@ _MAX_VOXELS = 2**53
 """Maximum number of voxels along one axis: float64 counts no further."""
 _MIN_VOXELS = 3
 """Minimum number of voxels with a plane."""
-_POINTS_AT_ONCE = 2**19
-"""Number of points whose voxels are found at a time, in 60 MB."""
+_POINTS_AT_ONCE = 2**17
+"""Number of points whose voxels are found at a time, in 15 MB."""
 _SAMPLE_SIZE = 10_000
 """Number of points from which the borders of slabs of about equal size are found."""
 _MAX_KEYS = 2**62
