@@ -12,8 +12,9 @@ constexpr float TYPICAL = 0.42f;       // Qn's difference / length of the shorte
 constexpr float MIN_MARGIN = 8;        // differences on each side of a window, and as a fraction of
 constexpr float MARGIN = 0.6f;         // the number by which the nearest limit misses the rank
 constexpr int MAX_DIFFERENCES = 2048;  // in a window
-constexpr int NUM_WINDOWS = 2;         // windows before all differences are searched
-constexpr int FREE_TURNS = 4;          // turns after which a search bisects
+constexpr int NUM_WINDOWS = 4;         // windows before all differences between limits are searched
+constexpr int MAX_ROUNDS = NUM_WINDOWS + 4, MAX_TURNS = 1000;  // of rows that are not sorted
+constexpr int FREE_TURNS = 4;  // turns in a window after which every second one bisects
 
 struct Points {
   Column columns[3];
@@ -70,6 +71,7 @@ struct Bracket {
     low = where(moves_low, limit, low), few = where(moves_low, count, few);
     high = where(moves_high, limit, high), many = where(moves_high, count, many);
   }
+  INLINE_MEMBER Lanes step() const { return (high - low) / (many - few); }  // between differences
 };
 
 // Calls `visit` with the differences of sorted rows lag by lag, until one has no difference within
@@ -144,10 +146,13 @@ struct Window {
   }
 };
 
-// The C(h, 2)-th smallest difference of each lane of sorted rows; NaN if one may be infinite.
+// The C(h, 2)-th smallest difference of each lane of sorted rows; NaN if one may be infinite, or if
+// the rows are not sorted.
 //
-// Counting the differences up to a typical one leads to a window around the result. Regula falsi
-// searches the few differences in the window; where it misses, those up to the shortest half.
+// Counting the differences up to a typical one leads to a window around the result, and the density
+// in a window that misses it to the next one. Regula falsi searches the few differences in a window.
+// Where windows miss, such as between tied differences, all of them are searched, or looked at until
+// those left fit in a window.
 SEPARATE Lanes majority_difference(const Column& rows, int n) {
   Window window;
   const int lags = n / 2, rank = lags * (lags + 1) / 2;
@@ -162,35 +167,43 @@ SEPARATE Lanes majority_difference(const Column& rows, int n) {
   bracket.narrow(pivot, count_differences(rows, n, pivot));
   Lanes result = where(spread < INFINITE, Lanes{}, all(__builtin_nanf("")));
   Flags open = (shortest > 0) & (spread < INFINITE);
-  for (int round = 0; is_any(open); round++) {
+  Lanes step = bracket.step();
+  for (int round = 0; is_any(open) && round < MAX_ROUNDS; round++) {
     const Lanes missing = wanted - bracket.few, excess = bracket.many - wanted;
     const Lanes off = smaller(missing, excess);
     const Lanes margin = smaller(off * MARGIN + all(MIN_MARGIN), all(MAX_DIFFERENCES / 16));
-    const Lanes step = (bracket.high - bracket.low) / (missing + excess);
+    const Lanes up = bracket.low + step * missing, down = bracket.high - step * excess;
     Lanes first = bracket.low, last = bracket.high;
-    if (round < NUM_WINDOWS) first = larger(first, bracket.low + step * (missing - margin));
-    if (round < NUM_WINDOWS) last = smaller(last, bracket.low + step * (missing + margin));
+    const Lanes guess = larger(smaller(where(missing < excess, up, down), last), first);
+    if (round < NUM_WINDOWS) first = larger(first, guess - step * margin);
+    if (round < NUM_WINDOWS) last = smaller(last, guess + step * margin);
     window.collect(rows, n, where(open, first, last), last);
-    bracket.narrow(first, to_float(window.below)), bracket.narrow(last, to_float(window.within));
-    Flags searched = open & (to_float(window.below) < wanted) & (to_float(window.within) > wanted);
-    open = open & ~searched;
+    const Lanes below = to_float(window.below), within = to_float(window.within);
+    bracket.narrow(first, below), bracket.narrow(last, within);
+    step = where(within > below, (last - first) / (within - below), bracket.step());
+    if (is_any(open & (within <= below))) round = larger(round, NUM_WINDOWS);
+    Flags searched = open & (below < wanted) & (within > wanted);
     Bracket inside = bracket;
     Lanes least = inside.low;
-    for (int turn = 0; is_any(searched); turn++) {
-      const Lanes part = (wanted - inside.few) / (inside.many - inside.few);
-      const Lanes length = inside.high - inside.low;
-      Lanes next = larger(inside.low + length * (turn < FREE_TURNS ? part : all(0.5f)), least);
+    for (int turn = 0; is_any(searched) && turn < MAX_TURNS; turn++) {
+      const Lanes number = inside.many - inside.few, part = (wanted - inside.few) / number;
+      const bool has_window = window.size >= 0, bisects = turn % 2;
+      if (!has_window && !is_any(searched & (number >= MAX_DIFFERENCES / LANES))) break;
+      const Lanes fraction = bisects && !(has_window && turn < FREE_TURNS) ? all(0.5f) : part;
+      Lanes next = larger(inside.low + (inside.high - inside.low) * fraction, least);
       next = where(next < inside.high, next, inside.low);
       const Around around = window.look_around(rows, n, next);
       const Lanes found = to_float(around.count);
       const Flags is_few = found < wanted, is_next = magnitude(found - wanted) < 1;
       const Flags done = searched & (is_next | (is_few & (around.above >= inside.high)));
       result = where(done, where(is_few, around.above, around.below), result);
-      searched = searched & ~done;
+      open = open & ~done, searched = searched & ~done;
       inside.narrow(where(is_few, next, around.below), found);
       least = where(is_few, around.above, least);
     }
+    if (window.size < 0) bracket = inside;
   }
+  result = where(open, all(__builtin_nanf("")), result);
   return result + all(0);
 }
 
