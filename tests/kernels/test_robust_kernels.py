@@ -1,9 +1,12 @@
 """Kernels of robust fits equal their definitions to the bit."""
 
+from unittest import mock
+
 import pytest
 import torch
 
 from tests.kernels.clouds import both, needs_library
+from torchrg.robust import starts as robust_starts
 from torchrg.robust.exact import find_flats
 from torchrg.robust.lanes import columns_of_points, smallest_points
 from torchrg.robust.mcd import _concentrate
@@ -56,3 +59,24 @@ def test_concentrated_starts_are_those_of_the_definition(n, starts):
             found, expected = both(_concentrate, *arguments, max_steps)
             assert torch.equal(found.members, expected.members)
             assert torch.equal(found.determinants, expected.determinants)
+
+
+@pytest.mark.parametrize("n", [7, 8, 50, 150])
+def test_deterministic_starts_are_those_of_the_definition(n):
+    random = torch.randn(9, n, 3, generator=torch.Generator().manual_seed(n))
+    line = random[..., :1] * torch.tensor([1.0, 2.0, 3.0])
+    outliers, copies = random.clone(), random.clone()
+    outliers[:, : n * 4 // 10] += 50
+    copies[:, : n // 2 + 1] = random[:, :1]
+    kinds = random, random + 1e3, (2 * random).round(), outliers, line, copies
+    num_undefined = []
+    for patches in kinds:
+        columns = columns_of_points(patches)
+        definition = mock.Mock(wraps=robust_starts._sphered_sets)
+        with mock.patch.object(robust_starts, "_sphered_sets", definition):
+            found = initial_sets(columns, n // 2 + 1, "paper")[0]
+        num_undefined.append(sum(call.args[0][0].shape[1] for call in definition.mock_calls))
+        assert torch.equal(found, both(initial_sets, columns, n // 2 + 1, "paper")[1][0])
+    # Kernels leave patches to the definition where a scale is zero: on lines and among copies.
+    assert num_undefined[:2] == [0, 0]
+    assert num_undefined[3:] == [0, 9, 9]

@@ -93,6 +93,15 @@ def test_cells_and_tree_together_find_the_neighbors_of_every_point(kind):
     np.testing.assert_array_equal(np.sqrt(x * x + y * y + z * z), near[:, :20])
 
 
+@pytest.mark.skipif(not needs_library, reason="needs the library of kernels")
+def test_no_tree_is_built_where_cells_resolve_every_point(monkeypatch):
+    trees = []
+    monkeypatch.setattr("scipy.spatial.cKDTree", lambda points, **_: trees.append(points))
+    for kind in ("room", "exact grid", "far from the origin"):
+        search_knn(torch.from_numpy(cloud_of(kind)[0]), 20)
+    assert trees == []
+
+
 def test_duplicates_and_a_limit_of_the_distance_go_through_cells_too():
     points = torch.from_numpy(_surface(np.random.default_rng(2))[:400]).repeat_interleave(3, dim=0)
     found = search_knn(points, 12, max_distance=0.06)

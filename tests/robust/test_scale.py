@@ -90,6 +90,21 @@ def test_kernels_find_qn_of_the_definition_to_the_bit(n, rng):
     assert torch.equal(found.nan_to_num(nan=-1.0), expected.nan_to_num(nan=-1.0))
 
 
+@pytest.mark.skipif(not needs_library, reason="needs the library of kernels")
+@pytest.mark.parametrize("n", [50, 200, 512])
+def test_kernels_find_qn_where_windows_miss_it_or_overflow(n, rng):
+    normal = torch.randn(8, n, generator=rng)
+    clusters, half_tied = 50 * normal + 100, normal.clone()
+    clusters[:, : n * 6 // 10], half_tied[:, : n * 45 // 100] = normal[:, : n * 6 // 10], 0
+    heavy = normal * 10 ** (4 * torch.randn(8, n, generator=rng))
+    tied = torch.cat([normal.mul(steps).round() for steps in (0.5, 3, 20, 100)])
+    # Rows of one kind first, then rows of all kinds side by side.
+    rows = torch.cat([clusters, half_tied, heavy, (3 * normal).exp(), tied])
+    rows = torch.cat([rows, rows.view(8, 8, n).transpose(0, 1).reshape(-1, n)])
+    found, expected = both(qn, rows)
+    assert torch.equal(found, expected)
+
+
 @pytest.mark.parametrize("n", [2, 3, 4, 5, 8, 9, 31, 32, 33, 100, 401, 402, 1200])
 def test_qn_by_counting_pairs_is_that_by_listing_them(n, dtype, rng, monkeypatch):
     rows = rows_of_all_kinds(n, dtype, rng).requires_grad_()

@@ -63,7 +63,7 @@ INLINE int choose(Candidates& all, int n, float limit) {
 // Sorts chosen candidates by distance, then row.
 INLINE void sort(Candidates& all, int count, float limit) {
   constexpr int BLOCK = 2 * SHORT_LANES;
-  const float scale = 65535 / limit;
+  const float scale = smaller(65535 / limit, 3e38f);  // finite for tiny limits
   const int width = (count + BLOCK - 1) / BLOCK * BLOCK;
   for (int i = count; i < width; i++) all.chosen_key[i] = 0;
   for (int i = 0; i < width; i++) all.step[i] = int16_t(int(all.chosen_key[i] * scale) - 32768);
@@ -120,8 +120,8 @@ KERNEL morton_codes(int64_t num_points, const double* points, double x, double y
   return DONE;
 }
 
-// order.sort_integers: rows that sort keys, ties by row, and the keys in this order; a radix sort by
-// bytes, lowest first, without bytes that are the same in all keys.
+// order.sort_integers: rows that sort keys, ties by row, and the keys in this order; a radix sort
+// by bytes, lowest first, without bytes that are the same in all keys.
 KERNEL sort_integers(int64_t n, Longs keys, int64_t* rows, int64_t* sorted, int64_t* other_rows,
                      int64_t* others) {
   constexpr int BYTES = 8, VALUES = 256;
@@ -183,8 +183,8 @@ KERNEL fill_cells(int64_t num_points, int64_t num_cells, const double* points, i
 // `found`, renumbered by `order` if given; `certain` marks exact results.
 KERNEL search_cells(int64_t num_points, int64_t num_cells, int64_t num_lists, int64_t k,
                     const double* sorted, Ints rows, Ints starts, Flagged selected, Longs order,
-                    int32_t* found, bool* certain, int64_t from, int64_t to, int64_t width, int64_t height,
-                    int64_t first_row, double x, double y, double z, double size) {
+                    int32_t* found, bool* certain, int64_t from, int64_t to, int64_t width,
+                    int64_t height, int64_t first_row, double x, double y, double z, double size) {
   if (k < 1 || k > MAX_WIDTH || from < 0 || to > num_cells - 1) return TOO_WIDE;
   if (width < 1 || height < 1 || width > num_cells || height > num_cells) return TOO_WIDE;
   if (num_points > INT32_MAX || num_cells > INT32_MAX) return TOO_WIDE;

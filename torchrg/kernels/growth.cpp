@@ -70,7 +70,7 @@ KERNEL pass_edges(int64_t num_points, int64_t num_rows, int64_t k, Floats points
   return DONE;
 }
 
-// paper.find_sharp_points: squared chords between the normals (3, N) of the first and all neighbors.
+// paper.find_sharp_points: squared chords of the normals (3, N) of the first and all neighbors.
 KERNEL neighbor_chords(int64_t num_points, int64_t num_rows, int64_t k, Floats normals,
                        Ints indices, float* chords) {
   if (k < 1 || k > MAX_WIDTH) return TOO_WIDE;
@@ -176,8 +176,8 @@ KERNEL crossing_edges(int64_t num_points, int64_t k, int64_t num_rows, Ints labe
   return DONE;
 }
 
-// adjacency._length_on_line: distinct cells of the lines of pairs that contain the middle of an edge.
-// `slots` is a hash table of indices of found cells.
+// adjacency._length_on_line: distinct cells of the lines of pairs that contain the middle of an
+// edge. `slots` is a hash table of indices of found cells.
 KERNEL line_cells(int64_t num_points, int64_t num_edges, int64_t num_pairs, int64_t num_slots,
                   Floats points, Ints sources, Ints targets, Longs pairs, const double* along,
                   const double* spacing, double max_cell, int32_t* slots, int64_t* owners,

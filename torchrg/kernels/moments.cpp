@@ -295,7 +295,7 @@ KERNEL fit_pixel_regions(int64_t h, int64_t w, int64_t n, int64_t num, Doubles v
   });
 }
 
-// Segments.quantile and moments.kth_smallest: the value of a rank (from 0) in each region, NaN last.
+// Segments.quantile, moments.kth_smallest: the value of a rank (from 0) in each region, NaN last.
 KERNEL kth_values(int64_t n, int64_t num, Doubles values, Longs counts, Longs ranks, double* found,
                   double* scratch) {
   for (int64_t m = 0, i = 0; m < num; m++) {

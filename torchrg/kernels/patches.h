@@ -74,7 +74,7 @@ struct Rows {
     }
     return inside;
   }
-  // Adds a row, whose results go to the position of the same number; returns whether all lanes are used.
+  // Adds a row, whose results go to the position of its number; whether all lanes are used.
   INLINE_MEMBER bool add(int64_t number) {
     for (int lane = used; lane < LANES; lane++) numbers[lane] = positions[lane] = number;
     return ++used == LANES;

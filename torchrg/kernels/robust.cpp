@@ -97,7 +97,7 @@ SEPARATE Lanes count_differences(const Column& rows, int n, Lanes pivot) {
 }
 
 struct Around {
-  Flags count{};                            // differences at most a pivot
+  Flags count{};                              // differences at most a pivot
   Lanes below{}, above = Lanes{} + INFINITE;  // the largest of them, and the smallest above
 
   INLINE_MEMBER Flags add(Lanes difference, Lanes pivot) {
@@ -149,10 +149,10 @@ struct Window {
 // The C(h, 2)-th smallest difference of each lane of sorted rows; NaN if one may be infinite, or if
 // the rows are not sorted.
 //
-// Counting the differences up to a typical one leads to a window around the result, and the density
-// in a window that misses it to the next one. Regula falsi searches the few differences in a window.
-// Where windows miss, such as between tied differences, all of them are searched, or looked at until
-// those left fit in a window.
+// Counting the differences up to a typical one leads to a window around the result, and the
+// density in a window that misses it to the next one. Regula falsi searches the few differences
+// in a window. Where windows miss, such as between ties, all differences between the limits are
+// searched, or looked at until those left fit in a window.
 SEPARATE Lanes majority_difference(const Column& rows, int n) {
   Window window;
   const int lags = n / 2, rank = lags * (lags + 1) / 2;
@@ -237,7 +237,7 @@ struct Matrix {
 
 // Weighted second moments about the mean or zero.
 SEPARATE Matrix find_moments(const Points& points, const Column& weights, int n,
-                                    bool is_centered) {
+                             bool is_centered) {
   Matrix found;
   Lanes center[3], count{};
   for (int k = 0; k < n; k++) count += weights[k];
@@ -441,8 +441,8 @@ KERNEL smallest_points(int64_t n, int64_t M, Floats values, int64_t size, float*
   return DONE;
 }
 
-// starts._sphered_sets: the six deterministic starts, and where the definition must find them, since
-// a scale is zero or a number infinite.
+// starts._sphered_sets: the six deterministic starts, and where the definition must find them,
+// since a scale is zero or a number infinite.
 KERNEL deterministic_sets(int64_t num_points, int64_t M, int64_t T, Floats x, Floats y, Floats z,
                           Floats tx, Floats ty, Floats tz, Floats scores, double factor,
                           int64_t size, float* sets, bool* undefined) {
