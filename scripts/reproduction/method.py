@@ -17,7 +17,7 @@ from torchrg import estimate_normals, load_config, search_knn
 from torchrg.linalg.moments import project, unbind_columns
 from torchrg.neighbors.knn import gather_columns
 from torchrg.regions.edges import coplanarity_limits, patch_radii
-from torchrg.regions.shared_neighbors import SharedNeighbors, min_shared_neighbors
+from torchrg.regions.shared_neighbors import connected_neighbors, min_shared_neighbors
 from torchrg.structures import Neighbors
 
 FRAMEWORK = (
@@ -207,7 +207,7 @@ def _test(title: str, cloud: Tensor, axes: tuple[int, int]) -> Case:
     limit = coplanarity_limits(residuals, floor)
     every = torch.ones_like(residuals, dtype=torch.bool)
     min_shared = min_shared_neighbors(settings_.growing.connectivity, settings_.normals.k)
-    connective = SharedNeighbors(Neighbors(neighbors.indices), min_shared).connected(one, every)
+    connective = connected_neighbors(Neighbors(neighbors.indices), one, every, min_shared)
     return Case(
         title,
         axes,

@@ -109,7 +109,7 @@ def test_absorption_follows_its_rule_literally():
     found = assign_unlabeled(
         points,
         labels,
-        KnnAdjacency(neighbors),
+        KnnAdjacency(neighbors).neighbor_rows,
         planes,
         reach,
         valid=valid,
@@ -126,7 +126,6 @@ def test_entries_that_are_no_neighbours_are_beside_no_point():
     adjacency = KnnAdjacency(Neighbors(torch.tensor([[0, 1], [1, 2], [2, 0]]), valid))
     assert adjacency.neighbor_rows(torch.tensor([0, 1, 2])).tolist() == [[1], [1], [2]]
     assert adjacency.neighbor_rows(slice(1, 3)).tolist() == [[1], [2]]
-    assert adjacency.frontier(torch.tensor([0, 1]), torch.tensor([2])).tolist() == []
     assert adjacency.contacts(torch.tensor([0, 1, 2]))[0].tolist() == [[0, 1]]
 
 

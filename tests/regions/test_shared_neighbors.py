@@ -6,7 +6,7 @@ import torch
 
 from tests.regions import growing_clouds
 from torchrg.neighbors import search_knn
-from torchrg.regions.shared_neighbors import SharedNeighbors, min_shared_neighbors
+from torchrg.regions.shared_neighbors import connected_neighbors, min_shared_neighbors
 from torchrg.structures import Neighbors
 
 
@@ -34,22 +34,21 @@ def test_counts_equal_those_of_sets(kind, max_distance, monkeypatch):
     neighbors = search_knn(points, 12, max_distance=max_distance, canonical=True)
     counted = torch.ones(len(points), 12).bool() if max_distance is None else neighbors.valid
     for min_shared in (0, 1, 6, 9, 12):
-        shared = SharedNeighbors(neighbors, min_shared)
         for rows in (slice(0, 50), slice(50, len(points))):
-            found = shared.connected(rows, counted[rows])
+            found = connected_neighbors(neighbors, rows, counted[rows], min_shared)
             assert torch.equal(found, (expected(neighbors, min_shared) & counted)[rows])
 
 
 def test_long_lists_do_not_overflow_the_counter():
     neighbors = Neighbors(torch.arange(300).expand(300, 300))
     everyone = torch.ones(300, 300, dtype=torch.bool)
-    assert SharedNeighbors(neighbors, 300).connected(slice(0, 300), everyone).all()
+    assert connected_neighbors(neighbors, slice(0, 300), everyone, 300).all()
 
 
 def test_only_edges_that_were_asked_for_are_answered():
     neighbors = Neighbors(torch.arange(4).expand(4, 4))
     asked = torch.eye(4, dtype=torch.bool)
-    assert torch.equal(SharedNeighbors(neighbors, 2).connected(slice(0, 4), asked), asked)
+    assert torch.equal(connected_neighbors(neighbors, slice(0, 4), asked, 2), asked)
 
 
 def test_the_fraction_is_the_decimal_that_was_written():

@@ -87,7 +87,7 @@ def connect_pixels(flat: Tensor, right: Tensor, down: Tensor) -> Tensor:
 
 
 class PixelGrid:
-    """8-connected pixel grid, a :class:`torchrg.regions.repair.Adjacency`."""
+    """8-connected pixel grid."""
 
     def __init__(self, shape: torch.Size) -> None:
         self.height, self.width = shape
@@ -99,12 +99,6 @@ class PixelGrid:
         column = (rows[:, None] % self.width + right).clamp(0, self.width - 1)
         near_rows: Tensor = row * self.width + column
         return near_rows
-
-    def frontier(self, candidates: Tensor, changed: Tensor) -> Tensor:
-        """Return the candidates that have a changed neighbor."""
-        is_near = candidates.new_zeros(self.height * self.width, dtype=torch.bool)
-        is_near[self.neighbor_rows(changed)] = True
-        return candidates[is_near[candidates]]
 
     def contacts(self, labels: Tensor) -> tuple[Tensor, Tensor]:
         """Return the pairs of adjacent regions, and the number of contacts of each pair."""
@@ -160,8 +154,8 @@ def assign_unlabeled_pixels(
     """Apply :func:`torchrg.regions.repair.assign_unlabeled` to the pixels of an image."""
     seen = cloud.seen
     if not has_kernels(cloud.values):
-        grid = PixelGrid(seen.shape)
-        return assign_unlabeled(cloud.points, labels, grid, planes, reach, valid=seen.flatten())
+        cloud_of_pixels = cloud.points, labels, PixelGrid(seen.shape).neighbor_rows
+        return assign_unlabeled(*cloud_of_pixels, planes, reach, valid=seen.flatten())
     image = labels.view(seen.shape).clone()
     tables = planes.normal, planes.center, reach
     kernels.call("assign_unlabeled_pixels", *cloud[:3], seen, image, *tables)

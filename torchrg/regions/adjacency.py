@@ -125,14 +125,6 @@ class KnnAdjacency:
         near, counted = self.neighbors.select(rows)
         return near if counted is None else torch.where(counted, near, self._points[rows])
 
-    def frontier(self, candidates: Tensor, changed: Tensor) -> Tensor:
-        """Return the candidates that have a changed neighbor."""
-        num_points = len(self.neighbors.indices)
-        is_changed = torch.zeros(num_points, dtype=torch.bool, device=candidates.device)
-        is_changed[changed] = True
-        near = Neighbors(self.neighbor_rows(candidates))
-        return candidates[near.gather(is_changed).any(dim=1)]
-
     def contacts(self, labels: Tensor) -> tuple[Tensor, Tensor]:
         """Apply :func:`find_region_pairs` to the nearest neighbors."""
         return find_region_pairs(labels, self._all, _NEAREST)

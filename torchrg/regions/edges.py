@@ -22,7 +22,7 @@ from torchrg.linalg.angles import deg_to_sq_chord, sq_chords
 from torchrg.linalg.moments import Columns, project, sq_lengths, to_column_major
 from torchrg.linalg.precision import rounded_sqrt
 from torchrg.neighbors.knn import gather_columns
-from torchrg.regions.shared_neighbors import SharedNeighbors, min_shared_neighbors
+from torchrg.regions.shared_neighbors import connected_neighbors, min_shared_neighbors
 from torchrg.robust.scale import QN_FACTOR, median, qn
 from torchrg.structures import Neighbors
 from torchrg.structures.points import Rows
@@ -83,15 +83,15 @@ def mark_edges(
     point alone, the second value is None. ``limit`` is the curvature limit.
     """
     is_global = config.seed_rule == "curvature" and config.curvature_scope == "cloud"
-    order_independent, shared = is_global and not has_late_promotion(config), None
+    order_independent = is_global and not has_late_promotion(config)
     num_points, k = cloud.neighbors.indices.shape
-    if config.connectivity is not None:
-        shared = SharedNeighbors(cloud.neighbors, min_shared_neighbors(config.connectivity, k))
+    min_shared = min_shared_neighbors(config.connectivity or 0.0, k)
     joins = np.zeros((num_points, 8 * -(-k // 64)), dtype=np.uint8)
     seeds = joins if order_independent else np.zeros_like(joins)
 
     def mark(rows: slice) -> None:
-        connect = None if shared is None else partial(shared.connected, rows)
+        test = partial(connected_neighbors, cloud.neighbors, rows, min_shared=min_shared)
+        connect = None if config.connectivity is None else test
         accepted, connected = accept_edges(cloud, config, rows, connect)
         _write_bits(joins[rows], accepted)
         if not order_independent:

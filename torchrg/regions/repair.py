@@ -4,7 +4,7 @@ import heapq
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -48,16 +48,6 @@ _MAX_FACET_STEP = 2.0
 warp bends a surface, but does not double it, as a table top and its underside do."""
 
 
-class Adjacency(Protocol):
-    """Adjacency of points (:mod:`torchrg.regions.adjacency`) or of pixels."""
-
-    def neighbor_rows(self, rows: Tensor) -> Tensor:
-        """Return the neighbors of the given points ``(n,)``, shape ``(n, 8)``."""
-
-    def frontier(self, candidates: Tensor, changed: Tensor) -> Tensor:
-        """Return the candidates that have a changed neighbor."""
-
-
 def refine_regions(
     cloud: GrowingInput, labels: Tensor, config: GrowingConfig, fits: RegionFits | None = None
 ) -> Tensor:
@@ -77,7 +67,7 @@ def refine_regions(
         labels = assign_unlabeled(
             cloud.points,
             _remove_inconsistent(cloud, labels, planes.normal, config),
-            adjacency,
+            adjacency.neighbor_rows,
             planes,
             planes.scale_thickness(config.absorb_reach),
             valid=cloud.valid,
@@ -154,7 +144,7 @@ def value_of_points(values: Tensor, labels: Tensor, unlabeled: float) -> Tensor:
 def assign_unlabeled(
     points: Tensor,
     labels: Tensor,
-    adjacency: Adjacency,
+    neighbor_rows: Callable[[Tensor], Tensor],
     planes: RegionPlanes,
     reach: Tensor,
     *,
@@ -168,8 +158,8 @@ def assign_unlabeled(
     angle between its normal, if any, and the plane normal must be at most ``max_angle_deg``. The
     nearest plane wins. Newly labeled points can admit their neighbors.
 
-    ``points`` ``(N, 3)`` and ``labels`` ``(N,)`` belong to a cloud or an image, matching
-    ``adjacency``. A ``reach`` ``(M,)`` of 0 admits only points exactly on the plane, NaN none. Only
+    ``points`` ``(N, 3)`` and ``labels`` ``(N,)`` belong to a cloud or an image, whose
+    ``neighbor_rows`` ``(n, 8)`` are those of given points ``(n,)``. A ``reach`` ``(M,)`` of 0 admits only points exactly on the plane, NaN none. Only
     ``valid`` points ``(N,)`` are assigned.
     """
     # int32 is faster to index and halves the memory.
@@ -179,7 +169,7 @@ def assign_unlabeled(
     while len(rows):
         joining = []
         for part in torch.split(rows, ROWS_AT_ONCE):
-            near = Neighbors(adjacency.neighbor_rows(part).T).gather(labels)
+            near = Neighbors(neighbor_rows(part).T).gather(labels)
             is_adjacent = nonzero_rows((near >= 0).any(dim=0))
             part, near = part[is_adjacent], near[:, is_adjacent]
             distance = planes.signed_distances(points[part], near).abs_()
@@ -191,9 +181,10 @@ def assign_unlabeled(
             joining.append(torch.stack([part, choice])[:, min_cost.isfinite()])
         rows, choice = torch.cat(joining, dim=1)
         labels[rows] = choice.to(labels)
+        is_new = torch.zeros_like(valid).index_fill_(0, rows, True)
         candidates = candidates[labels[candidates] == UNLABELED]
         # A rejected point is reconsidered only if one of its neighbors was labeled.
-        rows = adjacency.frontier(candidates, rows)
+        rows = candidates[Neighbors(neighbor_rows(candidates)).gather(is_new).any(dim=1)]
     return labels.long()
 
 

@@ -25,44 +25,32 @@ def min_shared_neighbors(connectivity: float, k: int) -> int:
     return math.ceil(round(connectivity * k, 9))
 
 
-class SharedNeighbors:
-    """Connectivity test: whether two points share at least ``min_shared`` neighbors.
+def connected_neighbors(
+    neighbors: Neighbors, rows: slice, candidates: Tensor, min_shared: int
+) -> Tensor:
+    """Return a mask of the edges between points that share ``min_shared`` neighbors, eq. (10).
+
+    Only edges in the mask ``candidates`` from the points ``rows`` are tested, shape ``(n, K)``,
+    bool; all other edges are False. Each point is in its own list.
 
     The lists of a block of points are rows of a matrix with one column per member, i.e. per point
     in any list. The product of two rows counts their common neighbors. Lists of points outside the
     block lose only members that are in no list of the block, so the counts are exact. Points should
-    be in canonical order: a block is then a surface patch with few members. Each point is in its
-    own list.
+    be in canonical order: a block is then a surface patch with few members.
     """
+    if min_shared <= 0:
+        return candidates.clone()
+    if kernels.serve(*neighbors, candidates, k=candidates.shape[1]):
+        numbers = torch.empty_like(neighbors.indices[:, 0])
+        edges = *neighbors, candidates, numbers, rows.start, min_shared
+        return kernels.call("connected", *edges)[0]
+    size = _BLOCK_SIZE if candidates.device.type == "cpu" else _DEVICE_BLOCK_SIZE
 
-    def __init__(self, neighbors: Neighbors, min_shared: int) -> None:
-        self._neighbors = neighbors
-        self._min_shared = min_shared
-
-    def connected(self, rows: slice, candidates: Tensor) -> Tensor:
-        """Return a mask of the block's edges that join connected points, eq. (10).
-
-        Only edges in the mask ``candidates`` from the points ``rows`` are tested, shape ``(n, K)``,
-        bool; all other edges are False.
-        """
-        if self._min_shared <= 0:
-            return candidates.clone()
-        if kernels.serve(*self._neighbors, candidates, k=candidates.shape[1]):
-            numbers = torch.empty_like(self._neighbors.indices[:, 0])
-            edges = *self._neighbors, candidates, numbers, rows.start, self._min_shared
-            return kernels.call("connected", *edges)[0]
-        size = _BLOCK_SIZE if candidates.device.type == "cpu" else _DEVICE_BLOCK_SIZE
-
-        def count(block: slice) -> Tensor:
-            return self._count(rows.start + block.start, rows.start + block.stop)
-
-        shared = map_tasks(count, split_rows(len(candidates), size), candidates.device)
-        return candidates & (torch.cat(shared) >= self._min_shared)
-
-    def _count(self, start: int, stop: int) -> Tensor:
+    def count(block: slice) -> Tensor:
         """Return the number of common neighbors along all edges of a block, shape ``(n, K)``."""
-        members, lists = torch.unique(self._neighbors.indices[start:stop], return_inverse=True)
-        near = self._neighbors.select(members)
+        lists = neighbors.indices[rows.start + block.start : rows.start + block.stop]
+        members, lists = torch.unique(lists, return_inverse=True)
+        near = neighbors.select(members)
         columns = torch.searchsorted(members, near.indices).clamp(max=len(members) - 1)
         counted = (members[columns] == near.indices) & near.mask()
         occurs = torch.zeros(len(members), len(members) + 1, device=members.device)
@@ -71,3 +59,6 @@ class SharedNeighbors:
         occurs = occurs[:, :-1]
         # Each point is the first in its list.
         return (occurs[lists[:, 0]] @ occurs.T).gather(1, lists)
+
+    shared = map_tasks(count, split_rows(len(candidates), size), candidates.device)
+    return candidates & (torch.cat(shared) >= min_shared)

@@ -37,7 +37,7 @@ def test_ridges_and_valleys_blunt_and_sharp_are_explained(angle, sign, rng):
     columns = unbind_columns(patch * sign)
     counted, noise = torch.ones_like(columns[0]), torch.tensor([0.005])
     start = vote_planes(columns, noise, truth[None], counted)
-    wedge = fit_wedges(columns, *start, noise).planes
+    wedge = fit_wedges(columns, *start, noise)[0]
     assert float(wedge.deviations) < 1.3 * 0.005
     assert float(unsigned_angle_deg(wedge.normals, truth[None])) < 1.5
 
@@ -47,7 +47,7 @@ def test_a_corner_needs_three_planes(rng):
     columns = unbind_columns(patch)
     counted, noise = torch.ones_like(columns[0]), torch.tensor([0.005])
     start = vote_planes(columns, noise, truth[None], counted)
-    wedge = fit_wedges(columns, *start, noise).planes
+    wedge = fit_wedges(columns, *start, noise)[0]
     corner = fit_corners(columns, split_by_votes(columns, *start, noise))
     assert float(wedge.deviations) > 2 * 0.005
     assert float(corner.deviations) < 1.3 * 0.005
@@ -58,4 +58,4 @@ def test_a_single_plane_is_no_wedge(rng):
     columns = unbind_columns(torch.rand(1, 50, 3, generator=rng) * torch.tensor([1.0, 1, 0]))
     noise = torch.tensor([0.01])
     up, zero = torch.tensor([[0.0, 0, 1]]), torch.zeros(1)
-    assert not fit_wedges(columns, up, zero, noise).planes.deviations.isfinite().any()
+    assert not fit_wedges(columns, up, zero, noise)[0].deviations.isfinite().any()

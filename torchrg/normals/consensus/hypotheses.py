@@ -142,18 +142,6 @@ class MeetingPlanes(NamedTuple):
     deviations: Tensor
 
 
-class Wedge(NamedTuple):
-    """Two meeting planes, and the plane of each point.
-
-    ``first`` are the points of the first plane, weights 0 or 1; ``outer`` are signed distances of
-    the neighbors to the surface, both ``(n, K)``.
-    """
-
-    planes: MeetingPlanes
-    first: Tensor
-    outer: Tensor
-
-
 def fit_meeting_planes(
     columns: Columns, normals: Tensor, offsets: Tensor, noise: Tensor
 ) -> MeetingPlanes:
@@ -163,14 +151,13 @@ def fit_meeting_planes(
     Three planes have two starts: the two planes and the points off them; and that one plane with
     the voted planes of its outliers.
     """
-    wedge = fit_wedges(columns, normals, offsets, noise)
-    two = wedge.planes
+    two, of_first, outer = fit_wedges(columns, normals, offsets, noise)
     rows = (two.deviations > constants.CORNER_LIMIT * noise).nonzero().squeeze(-1)
     corners = (columns[0][rows], columns[1][rows], columns[2][rows])
     start = MeetingPlanes(*(values[rows] for values in two))
     limit = constants.CORNER_FRACTION * start.deviations
     best = start._replace(deviations=limit)
-    first, third = wedge.first[rows], _off_surface(wedge.outer[rows], noise[rows])
+    first, third = of_first[rows], _off_surface(outer[rows], noise[rows])
     for groups in (
         (first * (1 - third), (1 - first) * (1 - third), third),
         split_by_votes(corners, normals[rows], offsets[rows], noise[rows]),
@@ -188,7 +175,9 @@ def fit_meeting_planes(
     return MeetingPlanes(*merged)
 
 
-def fit_wedges(columns: Columns, normals: Tensor, offsets: Tensor, noise: Tensor) -> Wedge:
+def fit_wedges(
+    columns: Columns, normals: Tensor, offsets: Tensor, noise: Tensor
+) -> tuple[MeetingPlanes, Tensor, Tensor]:
     """Fit the surface of the intersection of two half-spaces to each neighborhood.
 
     Let ``e_1`` and ``e_2`` be the distances of a point inside the two planes, each towards the side
@@ -197,7 +186,8 @@ def fit_wedges(columns: Columns, normals: Tensor, offsets: Tensor, noise: Tensor
     blunt). Planes and sides are fitted alternately, from one plane and the points off it by more
     than twice the noise on its fuller side. The point itself is assigned by the same rule. Unlike
     the nearest of two unbounded planes, this is correct for points that noise has moved out of the
-    solid. For arguments see :func:`fit_meeting_planes`.
+    solid. For arguments see :func:`fit_meeting_planes`. Also returns the points of the first plane,
+    weights 0 or 1, and the signed distances of the neighbors to the surface, both ``(n, K)``.
     """
     distances = residuals(columns, normals, offsets)
     second, first = _off_surface(distances, noise), _near(distances, noise)
@@ -209,7 +199,7 @@ def fit_wedges(columns: Columns, normals: Tensor, offsets: Tensor, noise: Tensor
         inside = _inside(one, second), _inside(other, first)
         first = above(inside[1], inside[0])
         second, outer = 1 - first, torch.minimum(*inside)
-    return Wedge(_summary(planes, (first, second), outer, present), first, outer)
+    return _summary(planes, (first, second), outer, present), first, outer
 
 
 def fit_corners(columns: Columns, groups: Sequence[Tensor]) -> MeetingPlanes:
