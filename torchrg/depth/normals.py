@@ -71,13 +71,6 @@ class PixelPlanes(NamedTuple):
     pixels: Tensor
     noise: WindowNoise
 
-    @property
-    def tables(self) -> list[Tensor]:
-        """All windows in kernel format: squares, narrow windows, and their pixels."""
-        size = sum(table.numel() for table in self.squares.values())
-        squares = self.squares[1].as_strided((size,), (1,))
-        return [squares, self.narrow.flatten(), self.pixels]
-
     def select(self, index: Tensor) -> Windows:
         """Return the windows of pixels at row-major indices."""
         indices = self.choice.window.flatten()[index]

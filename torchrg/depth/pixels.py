@@ -80,26 +80,28 @@ def describe_pixels(
         valid, right, down = (torch.empty_like(seen) for _ in range(3))
         normals = values.new_empty(*values.shape, 3)
         found = Pixels(normals, curvature, noise, valid, right, down)
-        fixed = *image, x, y, choice.window, choice.flat, *planes.tables
+        size = sum(table.numel() for table in planes.squares.values())
+        windows = planes.squares[1].as_strided((size,), (1,)), planes.narrow.flatten()
+        fixed = *image, x, y, choice.window, choice.flat, *windows, planes.pixels
         parameters = *focal, *planes.noise, *limits
         pass_over_rows("describe_pixels", len(y), *fixed, *found, *parameters)
         return found
     index = torch.arange(values.numel(), device=values.device)
-    windows = Windows(*(column.view(values.shape) for column in planes.select(index)))
+    chosen = Windows(*(column.view(values.shape) for column in planes.select(index)))
     sides = planes.sides_and_centers(index)[0].view(2, *values.shape)
     noise = planes.noise.evaluate(values)
-    valid = choice.flat | (seen & windows.deviation.isfinite())
-    is_smooth = windows.deviation > FLAT * windows.tolerance
-    limit = torch.maximum(windows.tolerance, noise)
-    tolerance = torch.where(is_smooth, windows.deviation, limit)
-    scaled = windows.u_slope * focal[0], windows.v_slope * focal[1], windows.origin
+    valid = choice.flat | (seen & chosen.deviation.isfinite())
+    is_smooth = chosen.deviation > FLAT * chosen.tolerance
+    limit = torch.maximum(chosen.tolerance, noise)
+    tolerance = torch.where(is_smooth, chosen.deviation, limit)
+    scaled = chosen.u_slope * focal[0], chosen.v_slope * focal[1], chosen.origin
     length = (scaled[0].square() + scaled[1].square() + scaled[2].square()).sqrt()
     length = torch.where(length > 0, length, 1.0)
     z = 1 / torch.where(values > 0, values, 1.0)
-    across = (z * torch.where(valid, windows.deviation, 0.0) / length).square()
+    across = (z * torch.where(valid, chosen.deviation, 0.0) / length).square()
     rays, y = x * x + (y * y)[:, None] + 1, y[:, None]
     along = torch.zeros_like(z)
-    slopes = (windows.u_slope, windows.v_slope)
+    slopes = (chosen.u_slope, chosen.v_slope)
     for side, slope, f, coordinate in zip(sides.flip(0), slopes, focal, (x, y), strict=True):
         step, spread = slope * z, (side * side - 1) / 12
         along = along + spread * (step * step * rays - 2 / f * step * coordinate + 1 / (f * f))

@@ -47,7 +47,7 @@ _MAX_RMS, _MAX_RMS_OF_FEW = 0.2, 0.1
 """Maximum RMS distance of flat regions to their plane, as a fraction of their length: a cube has
 0.29, clutter in rooms up to 0.19, a slab a third as thick as long 0.1. The second limit is for
 clouds of fewer than two neighborhoods, whose normals are equal, whatever their shape."""
-_SQ_WIDTH = 12.0
+SQ_WIDTH = 12.0
 """Squared width of a uniformly covered strip, in units of the variance across it."""
 
 
@@ -81,12 +81,6 @@ class RegionPlanes(NamedTuple):
     reach: Tensor
     bent: Tensor
     radius: Tensor
-
-    @property
-    def strips(self) -> Tensor:
-        """Mask of flat regions narrower than the neighborhood radius, shape ``(M,)``, bool."""
-        width = (_SQ_WIDTH * eigh3_lapack(self.covariance)[0][:, 1].clamp(min=0)).sqrt()
-        return ~self.curved & (width <= self.radius)
 
     @property
     def noise(self) -> Tensor:
@@ -230,7 +224,7 @@ def find_solid_regions(cloud: GrowingInput, labels: Tensor) -> Tensor:
     variances = eigh3_lapack(segments.moments(local, torch.ones_like(local[0]))[1])[0]
     are_few = len(labels) < 2 * cloud.neighbors.indices.shape[1]
     limit = _MAX_RMS_OF_FEW if are_few else _MAX_RMS
-    solid = variances[:, 0] > limit**2 * _SQ_WIDTH * variances[:, 2]
+    solid = variances[:, 0] > limit**2 * SQ_WIDTH * variances[:, 2]
     if bool(solid.any()):
         solid &= ~fit_planes(segments, cloud.points, cloud.normals).curved
     return solid

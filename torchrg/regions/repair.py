@@ -17,7 +17,7 @@ from torchrg.linalg.angles import deg_to_sq_chord, sq_chords
 from torchrg.linalg.moments import Segments, eigh3_lapack
 from torchrg.regions.adjacency import MIN_CONTACTS, PARALLEL_DEG, KnnAdjacency, find_region_pairs
 from torchrg.regions.edges import GrowingInput
-from torchrg.regions.fit import MIN_FITTED, RegionFits, RegionPlanes
+from torchrg.regions.fit import MIN_FITTED, SQ_WIDTH, RegionFits, RegionPlanes
 from torchrg.structures import UNLABELED, Neighbors
 
 _NORMAL_AGREEMENT = 0.3
@@ -80,7 +80,9 @@ def refine_regions(
         planes = fits.get(labels)
         # At the end of a strip narrower than a neighborhood, such as the rim of a table top, the
         # nearest points belong to the adjacent surfaces.
-        strips = labels.where(value_of_points(planes.strips, labels, False), UNLABELED)
+        width = (SQ_WIDTH * eigh3_lapack(planes.covariance)[0][:, 1].clamp(min=0)).sqrt()
+        are_strips = ~planes.curved & (width <= planes.radius)
+        strips = labels.where(value_of_points(are_strips, labels, False), UNLABELED)
         found = adjacency.contacts(labels), find_region_pairs(strips, cloud.neighbors)
         pairs, counts = map(torch.cat, zip(*found, strict=True))
         labels = merge_coplanar(labels, (pairs, counts), planes, tolerance=config.merge_tolerance)

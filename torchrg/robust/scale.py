@@ -5,7 +5,6 @@ The factors make the scales consistent with the standard deviation of normal dat
 
 from collections.abc import Callable
 from math import comb
-from statistics import NormalDist
 from typing import Literal
 
 import numpy as np
@@ -39,6 +38,8 @@ _MAX_LISTED_VALUES = 400
 """Number of values per row up to which Qn lists the pairs; beyond it, counting them is faster."""
 _TAU_SCALE_CUT = 3.0
 """Deviation at which values are truncated, in median deviations."""
+_TAU_CONSISTENCY = 0.9247153921761306
+"""Mean of the squares of standard normal values, truncated at this deviation."""
 
 
 def median(x: Tensor, *, dim: int = -1, mask: Tensor | None = None) -> Tensor:
@@ -226,7 +227,7 @@ def tau_of_sorted(rows: Tensor) -> Tensor:
     weights = (1 - (standard / _TAU_WEIGHT_CUT) ** 2).clamp(min=0) ** 2
     center = sum_points(weights * standard) / sum_points(weights)
     squares = ((standard - center) ** 2).clamp(max=_TAU_SCALE_CUT**2)
-    variance = sum_points(squares) / (len(lanes) * _tau_consistency())
+    variance = sum_points(squares) / (len(lanes) * _TAU_CONSISTENCY)
     return torch.where(spread > 0, unit * torch.where(spread > 0, variance, 1.0).sqrt(), spread)
 
 
@@ -251,14 +252,6 @@ def sum_points(values: Tensor) -> Tensor:
         folded = values[:half] + values[half : 2 * half]
         values = torch.cat([folded, values[2 * half :]]) if len(values) % 2 else folded
     return values[0]
-
-
-def _tau_consistency() -> float:
-    """Mean of the truncated squares of standard normal values."""
-    normal = NormalDist()
-    cut = _TAU_SCALE_CUT * normal.inv_cdf(0.75)
-    inside = (1 - cut * cut) * normal.cdf(cut) - cut * normal.pdf(cut) + cut * cut
-    return 2 * inside - 1
 
 
 def qn_of_sorted(rows: Tensor, *, finite_sample: bool) -> Tensor:

@@ -192,19 +192,14 @@ def _double_ranks(column: Tensor) -> Tensor:
     return (first + torch.searchsorted(ascending, rows, right=True) + 1).t()
 
 
-@lru_cache(maxsize=256)
-def _score_table(count: int) -> tuple[float, ...]:
-    """Normal scores of the doubled ranks 0 to 2 n; rank r has Phi^-1((r - 1/3) / (n + 1/3))."""
-    scores = [
-        NormalDist().inv_cdf((double / 2 - 1 / 3) / (count + 1 / 3))
-        for double in range(1, 2 * count + 1)
-    ]
-    return (scores[0], *scores)
-
-
 def _scores(columns: list[Tensor]) -> Tensor:
-    """Return the table of normal scores for the points of columns ``(K, M)``."""
-    return columns[0].new_tensor(_score_table(len(columns[0])))
+    """Return the normal scores of the doubled ranks 0 to 2 K of the points of columns ``(K, M)``.
+
+    Rank r has the score ``Phi^-1((r - 1/3) / (K + 1/3))``.
+    """
+    ranks = [max(double, 1) / 2 for double in range(2 * len(columns[0]) + 1)]
+    unit = len(columns[0]) + 1 / 3
+    return columns[0].new_tensor([NormalDist().inv_cdf((r - 1 / 3) / unit) for r in ranks])
 
 
 def _plane_starts(columns: list[Tensor], size: int) -> Tensor:

@@ -84,16 +84,16 @@ def fit_surfaces(
         residual = torch.where(has_planes, planes.deviations, scale)
         unit = torch.maximum(scale, residual)
         drop = (deviations[rows] / unit).square() - (residual / unit).square()
-        num_neighbors: int | Tensor = neighbors.indices.shape[1]
-        if neighbors.valid is not None:
-            num_neighbors = neighbors.valid[rows].sum(dim=1)
-        drop *= num_neighbors - _PARABOLOID_PARAMETERS
+        drop *= counts[rows] - _PARABOLOID_PARAMETERS
         upper = constants.MAX_GAIN
         gain[rows] = torch.where(has_planes, drop, -upper).clamp_(-upper, upper)
 
     candidates = broken & (_may_meet(broken, neighbors, chunk_size) | far_off)
-    for group in _group_by_count(candidates, neighbors):
-        map_selected(split, group, chunk_size)
+    counts = torch.full_like(neighbors.indices[:, 0], neighbors.indices.shape[1])
+    if neighbors.valid is not None:
+        counts = neighbors.valid.sum(dim=1)
+    for count in torch.unique(counts[candidates]).tolist():
+        map_selected(split, candidates & (counts == count), chunk_size)
     pooled = _mean_of_nearest(gain, neighbors, chunk_size)
     meets = broken & explained & (gain > constants.MIN_GAIN) & (pooled > constants.MIN_POOLED_GAIN)
     voted = broken & ~meets & far_off
@@ -132,14 +132,6 @@ def broken_planes(
     columns = _gather_counted(points, near)
     voted = vote_planes(columns, noise, normals, torch.ones_like(columns[0]))
     return TangentPlanes(*voted), fit_meeting_planes(columns, *voted, noise)
-
-
-def _group_by_count(chosen: Tensor, neighbors: Neighbors) -> list[Tensor]:
-    """Return the chosen points grouped by their number of counted neighbors."""
-    if neighbors.valid is None:
-        return [chosen]
-    count = neighbors.valid.sum(dim=1)
-    return [chosen & (count == number) for number in torch.unique(count[chosen]).tolist()]
 
 
 def _gather_counted(points: Tensor, near: Neighbors) -> Columns:
