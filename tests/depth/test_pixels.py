@@ -23,10 +23,10 @@ def test_a_window_holds_the_pixels_of_its_square(rng):
         for column in range(-(-width // size))
     ]
     pixels, others = torch.randint(height * width, (2, 400), generator=rng)
-    sides, middles = found.sides_and_centers(pixels)
+    _, sides, middles = found.select(pixels)
     expected, lengths = [], []
     for pixel, other in zip(pixels.tolist(), others.tolist(), strict=True):
-        top, bottom, left, right = squares[int(found.choice.window.flatten()[pixel])]
+        top, bottom, left, right = squares[int(found.window.flatten()[pixel])]
         row, column = divmod(other, width)
         expected.append(top <= row < bottom and left <= column < right)
         lengths.append([bottom - top, right - left])

@@ -45,55 +45,41 @@ _STEEP_SIZE = 2
 """Cell width of the windows used to measure jitter, in pixels."""
 
 
-class Choice(NamedTuple):
-    """The window index of each pixel ``(H, W)``, among the windows of all sizes.
+class PixelPlanes(NamedTuple):
+    """Windows of an image, and the window chosen by each pixel ``(H, W)``.
 
-    ``flat`` marks pixels with a flat window, ``edge`` flat windows that are not centered on the
-    pixel. Other pixels have the smallest square around them.
+    Windows are numbered from the smallest squares to the largest, then the horizontal narrow ones
+    around ``pixels`` ``(n,)``, then the vertical ones. ``window`` is the number of each pixel's
+    window; pixels without a flat one have the smallest square around them. ``flat`` marks pixels
+    with a flat window, ``edge`` flat windows that are not centered on the pixel. ``squares`` are
+    tables of :class:`Windows` by cell size, ``narrow`` is one ``(9, 2, n)``; ``noise`` is the noise
+    of the largest windows.
     """
 
     window: Tensor
     flat: Tensor
     edge: Tensor
-
-
-class PixelPlanes(NamedTuple):
-    """Windows of an image, and the window chosen by each pixel.
-
-    Windows are numbered from the smallest squares to the largest, then the horizontal narrow ones
-    around ``pixels`` ``(n,)``, then the vertical ones. ``squares`` are tables of :class:`Windows`
-    by cell size, ``narrow`` is one ``(9, 2, n)``; ``noise`` is the noise of the largest windows.
-    """
-
-    choice: Choice
     squares: dict[int, Tensor]
     narrow: Tensor
     pixels: Tensor
     noise: WindowNoise
 
-    def select(self, index: Tensor) -> Windows:
-        """Return the windows of pixels at row-major indices."""
-        indices = self.choice.window.flatten()[index]
-        tables = (*self.squares.values(), self.narrow)
-        columns = zip(*tables, strict=True)
-        return Windows(*(torch.cat([values.flatten() for values in c])[indices] for c in columns))
+    def select(self, index: Tensor) -> tuple[Windows, Tensor, Tensor]:
+        """Return the windows of pixels at row-major indices, their sides and their centers.
 
-    def sides_and_centers(self, index: Tensor) -> tuple[Tensor, Tensor]:
-        """Return sides (rows, columns) and centers (row, column) of the windows of pixels.
-
-        Both have the shape ``(2, n)``.
+        Sides (rows, columns) and centers (row, column) have the shape ``(2, n)``.
         """
-        width, dtype, parts = self.choice.window.shape[1], self.narrow.dtype, []
+        width, like, parts = self.window.shape[1], self.narrow, []
         for size, table in self.squares.items():
-            rows, columns = (torch.arange(n, dtype=dtype) for n in table.shape[1:])
-            grid = torch.cartesian_prod(rows, columns).T * size + (size - 1) / 2
-            parts.append(torch.cat([torch.full_like(grid, SIDE * size), grid]))
-        for sides in NARROW:
-            middles = torch.stack([self.pixels // width, self.pixels % width]).to(dtype).cpu()
+            numbers = (torch.arange(n, device=like.device) for n in table.shape[1:])
+            grid = torch.cartesian_prod(*numbers).T.to(like) * size + (size - 1) / 2
+            parts.append(torch.cat([table.flatten(1), torch.full_like(grid, SIDE * size), grid]))
+        middles = torch.stack([self.pixels // width, self.pixels % width]).to(like)
+        for sides, table in zip(NARROW, like.unbind(dim=1), strict=True):
             lengths = middles.new_tensor(sides)[:, None].expand_as(middles)
-            parts.append(torch.cat([lengths, middles]))
-        windows = torch.cat(parts, dim=1).to(index.device)[:, self.choice.window.flatten()[index]]
-        return windows[:2], windows[2:]
+            parts.append(torch.cat([table, lengths, middles]))
+        *windows, high, wide, row, column = torch.cat(parts, dim=1)[:, self.window.flatten()[index]]
+        return Windows(*windows), torch.stack([high, wide]), torch.stack([row, column])
 
 
 def fit_pixels(
@@ -128,27 +114,28 @@ def fit_pixels(
     noises = noise_by_size(squares, noise, dtype)
     jitter = find_jitter(squares[_STEEP_SIZE], _STEEP_SIZE)
     window = torch.arange(image.seen.numel(), device=image.seen.device).view(image.seen.shape)
-    choice = Choice(window, torch.zeros_like(image.seen), torch.zeros_like(image.seen))
+    flat, edge = torch.zeros_like(image.seen), torch.zeros_like(image.seen)
+    choice = window, flat, edge
     first = sum(math.prod(table.shape[1:]) for table in squares.values())
     num_squares = first
     for size in CELL_SIZES:
         quarters = size // 2 if size // 2 in squares else None
-        masks = (image.seen, choice.flat) if size == 1 else (None, None)
+        masks = (image.seen, flat) if size == 1 else (None, None)
         rate_windows(squares, size, noises, focal, masks, quarters=quarters)
         first -= math.prod(squares[size].shape[1:])
         offer_windows(choice, image, squares[size], size, first)
-    pixels = nonzero_rows(image.seen & ~choice.flat)
-    indices = torch.full_like(choice.window, -1)
+    pixels = nonzero_rows(image.seen & ~flat)
+    indices = torch.full_like(window, -1)
     indices.view(-1)[pixels] = torch.arange(len(pixels), device=pixels.device)
     narrow = fit_narrow_windows(image, indices, pixels)
     rate_windows({1: narrow}, 1, noises, focal, jitter=jitter)
     chosen, off_center = choose_narrow(image, indices, pixels, narrow)
     is_taken = chosen >= 0
     pixel = pixels[is_taken]
-    choice.window.view(-1)[pixel] = num_squares + chosen[is_taken]
-    choice.flat.view(-1)[pixel] = True
-    choice.edge.view(-1)[pixel] = off_center[is_taken]
-    return PixelPlanes(choice, squares, narrow, pixels, noises[CELL_SIZES[0]])
+    window.view(-1)[pixel] = num_squares + chosen[is_taken]
+    flat.view(-1)[pixel] = True
+    edge.view(-1)[pixel] = off_center[is_taken]
+    return PixelPlanes(*choice, squares, narrow, pixels, noises[CELL_SIZES[0]])
 
 
 def rate_windows(
@@ -210,13 +197,16 @@ def _deviation_of_quarters(deviation: Tensor, shape: torch.Size) -> Tensor:
     return torch.where(count > 0, squares / count, torch.inf).sqrt()
 
 
-def offer_windows(choice: Choice, image: Image, table: Tensor, size: int, first: int) -> None:
+def offer_windows(
+    choice: tuple[Tensor, Tensor, Tensor], image: Image, table: Tensor, size: int, first: int
+) -> None:
     """Offer windows of a size, numbered from ``first``, to pixels without a window.
 
     A pixel takes the window around its cell if it is flat (or, for the smallest size, smooth),
-    otherwise the flattest window that contains it.
+    otherwise the flattest window that contains it. ``choice`` is written to: the window, flat and
+    edge of :class:`PixelPlanes`.
     """
-    windows = Windows(*table)
+    windows, (window, flat, edge) = Windows(*table), choice
     if has_kernels(table):
         pass_over_rows("offer_windows", table.shape[1], *image, table, *choice, size, first)
         return
@@ -224,20 +214,20 @@ def offer_windows(choice: Choice, image: Image, table: Tensor, size: int, first:
     minimum, flattest = min_in_windows(windows.relative, REACH)
     off_center = torch.where(minimum.isfinite(), flattest, -1)
     reach = torch.maximum(_MAX_PIXEL_NOISE * windows.noise, windows.tolerance)
-    flat = torch.where(windows.relative.isfinite(), itself, -1)
-    offers = [(flat, _MAX_PIXEL_NOISE * windows.tolerance), (off_center, reach)]
+    centered = torch.where(windows.relative.isfinite(), itself, -1)
+    offers = [(centered, _MAX_PIXEL_NOISE * windows.tolerance), (off_center, reach)]
     if size == 1:
         smooth = torch.where(windows.deviation <= windows.max_bend, itself, -1)
         offers.insert(1, (smooth, torch.full_like(reach, torch.inf)))
     for index, reach in offers:
-        pixels = nonzero_rows(image.seen & ~choice.flat)
+        pixels = nonzero_rows(image.seen & ~flat)
         row, column = pixels // len(image.u), pixels % len(image.u)
         offered = index[row // size, column // size]
         is_taken = (offered >= 0) & _are_near(image, pixels, offered, table, reach)
         pixels = pixels[is_taken]
-        choice.window.view(-1)[pixels] = first + offered[is_taken]
-        choice.flat.view(-1)[pixels] = True
-        choice.edge.view(-1)[pixels] = index is off_center
+        window.view(-1)[pixels] = first + offered[is_taken]
+        flat.view(-1)[pixels] = True
+        edge.view(-1)[pixels] = index is off_center
 
 
 def choose_narrow(

@@ -71,7 +71,7 @@ def describe_pixels(
     deviation of a flat window: no region crosses a step. If both windows contain both pixels the
     angle may be larger: a crease between the pixels would lie within two flat windows.
     """
-    values, seen, choice = image.values, image.seen, planes.choice
+    values, seen, flat = image.values, image.seen, planes.flat
     x, y = image.u / focal[0], image.v / focal[1]
     wider = min(_WIDE_ANGLE_FACTOR * config.max_angle_deg, 90.0)
     limits = config.max_step, deg_to_sq_chord(config.max_angle_deg), deg_to_sq_chord(wider)
@@ -82,15 +82,15 @@ def describe_pixels(
         found = Pixels(normals, curvature, noise, valid, right, down)
         size = sum(table.numel() for table in planes.squares.values())
         windows = planes.squares[1].as_strided((size,), (1,)), planes.narrow.flatten()
-        fixed = *image, x, y, choice.window, choice.flat, *windows, planes.pixels
+        fixed = *image, x, y, planes.window, flat, *windows, planes.pixels
         parameters = *focal, *planes.noise, *limits
         pass_over_rows("describe_pixels", len(y), *fixed, *found, *parameters)
         return found
     index = torch.arange(values.numel(), device=values.device)
-    chosen = Windows(*(column.view(values.shape) for column in planes.select(index)))
-    sides = planes.sides_and_centers(index)[0].view(2, *values.shape)
+    flattened, sides, _ = planes.select(index)
+    chosen = Windows(*(column.view(values.shape) for column in flattened))
     noise = planes.noise.evaluate(values)
-    valid = choice.flat | (seen & chosen.deviation.isfinite())
+    valid = flat | (seen & chosen.deviation.isfinite())
     is_smooth = chosen.deviation > FLAT * chosen.tolerance
     limit = torch.maximum(chosen.tolerance, noise)
     tolerance = torch.where(is_smooth, chosen.deviation, limit)
@@ -102,7 +102,9 @@ def describe_pixels(
     rays, y = x * x + (y * y)[:, None] + 1, y[:, None]
     along = torch.zeros_like(z)
     slopes = (chosen.u_slope, chosen.v_slope)
-    for side, slope, f, coordinate in zip(sides.flip(0), slopes, focal, (x, y), strict=True):
+    for side, slope, f, coordinate in zip(
+        sides.view(2, *z.shape).flip(0), slopes, focal, (x, y), strict=True
+    ):
         step, spread = slope * z, (side * side - 1) / 12
         along = along + spread * (step * step * rays - 2 / f * step * coordinate + 1 / (f * f))
     total = across + along * z * z
@@ -132,21 +134,20 @@ def _join(
     angle and the wider angle.
     """
     max_step, max_sq_chord, wider_sq_chord = limits
-    flat, indices, width = planes.choice.flat, planes.choice.window.flatten(), len(image.u)
+    flat, indices, width = planes.flat, planes.window.flatten(), len(image.u)
     length, joined = flat.shape[axis] - 1, torch.zeros_like(flat)
     both = flat.narrow(axis, 0, length) & flat.narrow(axis, 1, length)
     here = nonzero_rows(torch.nn.functional.pad(both, (0, axis, 0, 1 - axis)))
     there = here + (width, 1)[axis]
     row, column = here // width, here % width
-    ours, theirs = planes.select(here), planes.select(there)
+    ours, sides, middles = planes.select(here)
+    theirs, their_sides, their_middles = planes.select(there)
     u_slope, v_slope = ours.u_slope - theirs.u_slope, ours.v_slope - theirs.v_slope
     step = u_slope * image.u[column] + v_slope * image.v[row] + ours.origin - theirs.origin
     next_step = step + (v_slope, u_slope)[axis]
     tolerance, normals = tolerance.flatten(), normals.view(-1, 3)
     limit = max_step * torch.maximum(tolerance[here], tolerance[there])
     turned = sq_chords(*(normals[at][:, :, None].unbind(dim=1) for at in (here, there))).squeeze(1)
-    sides, middles = planes.sides_and_centers(here)
-    their_sides, their_middles = planes.sides_and_centers(there)
     sq_noise = _sq_slope_noise(sides, tolerance[here])
     sq_noise = sq_noise + _sq_slope_noise(their_sides, tolerance[there])
     similar = u_slope.square() + v_slope.square() <= _MAX_SLOPE_NOISE**2 * sq_noise

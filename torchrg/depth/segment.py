@@ -115,7 +115,7 @@ def _segment(
     image, x, y = Image(inverse, seen, u, v), u / fx, v / fy
     planes = fit_pixels(image, focal=(fx, fy), noise=config.noise, dtype=depth.dtype)
     pixels = describe_pixels(image, planes, (fx, fy), config)
-    joins, flat, edge = (pixels.right, pixels.down), *planes.choice[1:]
+    joins, flat, edge = (pixels.right, pixels.down), planes.flat, planes.edge
     del planes
     num_seen = int(seen.count_nonzero())
     # Pixels without depth have inverse depth 0, which is less than that of others.

@@ -160,9 +160,9 @@ def assign_unlabeled(
     angle between its normal, if any, and the plane normal must be at most ``max_angle_deg``. The
     nearest plane wins. Newly labeled points can admit their neighbors.
 
-    ``points`` ``(N, 3)`` and ``labels`` ``(N,)`` belong to a cloud or an image, whose
-    ``neighbor_rows`` ``(n, 8)`` are those of given points ``(n,)``. A ``reach`` ``(M,)`` of 0 admits only points exactly on the plane, NaN none. Only
-    ``valid`` points ``(N,)`` are assigned.
+    ``points`` ``(N, 3)`` and ``labels`` ``(N,)`` belong to a cloud or an image; ``neighbor_rows``
+    returns the adjacent points ``(n, 8)`` of given ones ``(n,)``. A ``reach`` ``(M,)`` of 0 admits
+    only points exactly on the plane, NaN none. Only ``valid`` points ``(N,)`` are assigned.
     """
     # int32 is faster to index and halves the memory.
     labels = labels.to(torch.int32)
