@@ -225,9 +225,11 @@ def _fit_edges(
     mu = sq_distances.sort(dim=-1).values.gather(-1, rank)
     second = _fit_twice(turned, across, mu, mu / 2, limit, decay)
     firsts = _Solution(*(field[rows] for field in first))
-    better = (_cosine(firsts.through, second.through) < _SAME_COSINE) & ~_first_wins(
-        firsts, second, turned
-    )
+    few = _MIN_FRACTION * turned.counted.sum(dim=-1)
+    many_first, many_second = (found.heavy.sum(dim=-1) > few for found in (firsts, second))
+    nearer = firsts.error < second.error
+    first_wins = torch.where(many_second, nearer & many_first, nearer | many_first)
+    better = (_cosine(firsts.through, second.through) < _SAME_COSINE) & ~first_wins
     rows = rows[better]
     return (
         normals.index_copy(0, rows, second.normal[better]),
@@ -251,16 +253,6 @@ def _fit_twice(
     above = (points.distances(near.normal) * points.counted).sum(dim=-1) > 0
     error = torch.where(above, -height, height)
     return _Solution(near.normal, through.normal, error, weights > _MIN_HEAVY_WEIGHT)
-
-
-def _first_wins(first: _Solution, second: _Solution, points: _Offsets) -> Tensor:
-    """Return a mask of patches where the first solution wins, shape ``(n,)``."""
-    nearer = first.error < second.error
-    many_first, many_second = (
-        solution.heavy.sum(dim=-1) > _MIN_FRACTION * points.counted.sum(dim=-1)
-        for solution in (first, second)
-    )
-    return torch.where(many_second, nearer & many_first, nearer | many_first)
 
 
 def _sq_distances(points: _Offsets, normal: Tensor) -> Tensor:

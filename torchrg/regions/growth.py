@@ -123,7 +123,10 @@ def grow_regions(
     chunk_size = limit_rows(chunk_size, neighbors.indices.shape[1])
     order = None if canonical else canonical_order(cloud.points)
     if order is not None:
-        cloud = _reordered(cloud, order)
+        row_of = torch.empty(len(order), dtype=torch.int32, device=order.device)
+        row_of[order] = torch.arange(len(order), dtype=torch.int32, device=order.device)
+        lists = cloud.neighbors.select(order)
+        cloud = cloud.select(order, lists._replace(indices=lists.gather(row_of)))
     if needs_sampling(settings):
         settings = settings.with_sampling(measure_sampling(cloud.points, cloud.neighbors))
     labels = label_regions(cloud, grow(cloud, settings, chunk_size), settings, chunk_size)
@@ -205,7 +208,7 @@ def checked_cloud(
             )
         residual_rms = as_tensor(caller, "residual_rms", residual_rms).detach()
         check_shapes(caller, points=(points, "N 3"), residual_rms=(residual_rms, "N"))
-        check_floating(caller, points=points, residual_rms=residual_rms)
+        check_floating(caller, residual_rms=residual_rms)
         # The noise is unknown if the fit is exact.
         residual_rms = residual_rms.to(positions)
         floor = config.coplanarity_floor * neighborhood_radii(positions, neighbors)
@@ -228,14 +231,6 @@ def _add_colors(cloud: GrowingInput, colors: Colors | None, max_distance: float)
     check_shapes("grow_regions", points=(cloud.points, "N 3"), colors=(colors, "N C"))
     colors = to_column_major(colors.to(cloud.points.dtype))
     return cloud._replace(colors=colors, max_color_distance=max_distance)
-
-
-def _reordered(cloud: GrowingInput, order: Tensor) -> GrowingInput:
-    """Reorder the cloud by rows ``(N,)`` and remap its neighbor indices."""
-    row_of = torch.empty(len(order), dtype=torch.int32, device=order.device)
-    row_of[order] = torch.arange(len(order), dtype=torch.int32, device=order.device)
-    neighbors = cloud.neighbors.select(order)
-    return cloud.select(order, neighbors._replace(indices=neighbors.gather(row_of)))
 
 
 def rank_by_size(regions: Tensor, min_size: int) -> Tensor:

@@ -88,6 +88,11 @@ def map_values(
     return in_torch(values, *more)
 
 
+def log_values(values: Tensor) -> Tensor:
+    """Return natural logarithms that do not depend on the position of a value."""
+    return map_values(np.log, torch.log, values)
+
+
 class Ellipsoid(NamedTuple):
     """Weighted mean and scatter of each lane, in a factored form.
 

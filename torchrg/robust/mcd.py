@@ -15,6 +15,7 @@ from torchrg.robust.lanes import (
     determinant,
     fit_ellipsoid,
     is_in_kernels,
+    log_values,
     smallest_points,
     sq_distances,
     take_lanes,
@@ -23,7 +24,6 @@ from torchrg.robust.patches import PATCHES_IN_CACHE, RobustFit, fit_patchwise, p
 from torchrg.robust.scale import sum_points
 from torchrg.robust.starts import MCDStarts, draw_seed, elemental_sets, initial_sets, random_subsets
 from torchrg.robust.weights import (
-    Estimate,
     Inliers,
     Scaling,
     chi2_quantile,
@@ -224,7 +224,7 @@ def _fit_mcd(
 ) -> RobustFit:
     """Use the best set of a search as raw fit, and reweight by the distances to it."""
 
-    def estimator(columns: list[Tensor], floor: Tensor, size: int) -> Estimate:
+    def estimator(columns: list[Tensor], floor: Tensor, size: int) -> RobustFit:
         sets = search(columns, floor, size)
         best = sets.determinants.argmin(dim=0)
         members = sets.members.gather(1, best.expand(len(sets.members), 1, -1)).squeeze(1)
@@ -235,17 +235,18 @@ def _fit_mcd(
         location, final, support = reweight(columns, distances, settings.quantile, factor)
         if settings.inliers == "reweighted":
             distances = distances_to_support(columns, support, factor, floor)
-            support = within_quantile(distances, settings.quantile, len(columns)) > 0
-        return Estimate(
+            support = (within_quantile(distances, settings.quantile, len(columns)) > 0).t()
+        return RobustFit(
             location,
             final,
             support,
-            sq_distances=distances,
+            sq_distances=distances.t(),
             raw_location=torch.stack(ellipsoid.means, dim=-1),
             raw_covariance=covariance * raw_factor[:, None, None],
-            raw_support=members > 0,
-            objective=sets.determinants.gather(0, best[None]).squeeze(0),
-            singular=ellipsoid.singular,
+            raw_support=(members > 0).t(),
+            log_det=log_values(sets.determinants.gather(0, best[None]).squeeze(0)),
+            exact_fit=ellipsoid.singular,
+            valid=torch.ones_like(ellipsoid.singular),
         )
 
     def weigh(fit: RobustFit, points: Tensor) -> Tensor:

@@ -16,6 +16,7 @@ from torchrg.robust.lanes import (
     covariance_entries,
     determinant,
     fit_ellipsoid,
+    log_values,
     map_values,
     median_points,
     smallest_points,
@@ -25,7 +26,7 @@ from torchrg.robust.lanes import (
 from torchrg.robust.patches import RobustFit, fit_patchwise, patchwise
 from torchrg.robust.scale import half_size, sum_points
 from torchrg.robust.starts import Starts, initial_sets
-from torchrg.robust.weights import Estimate, chi2_quantile
+from torchrg.robust.weights import chi2_quantile
 
 Target = Literal["shape", "location"]
 """Estimate to which the efficiency of 95 % at the normal distribution refers."""
@@ -131,7 +132,7 @@ def _fit_shapes(
     def cutoff_of(size: int) -> float:
         return efficiency_constant(size, tuned_for) if tuned_for else breakdown_constant(size)
 
-    def estimator(columns: list[Tensor], floor: Tensor, size: int) -> Estimate:
+    def estimator(columns: list[Tensor], floor: Tensor, size: int) -> RobustFit:
         first, scale = _best_s_estimate(columns, floor, size, starts)
         if tuned_for is None:
             return _estimate(columns, first, first, scale, quantile)
@@ -186,8 +187,8 @@ def _best_s_estimate(
 
 def _estimate(
     columns: list[Tensor], raw: _Shape, final: _Shape, scale: Tensor, quantile: float
-) -> Estimate:
-    """Create the estimate of a shape at a scale."""
+) -> RobustFit:
+    """Create the fit of a shape at a scale."""
     size = len(columns)
     sq_scale = scale * scale
     distances = final.distances / sq_scale
@@ -197,16 +198,17 @@ def _estimate(
         denominator = _volume(shape.ellipsoid) / sq_scale
         return covariance_entries(columns, shape.ellipsoid.means, shape.weights, denominator)
 
-    return Estimate(
+    return RobustFit(
         location=torch.stack(final.ellipsoid.means, dim=-1),
         covariance=scatter(final),
-        support=distances <= bound,
-        sq_distances=distances,
+        support=(distances <= bound).t(),
+        sq_distances=distances.t(),
         raw_location=torch.stack(raw.ellipsoid.means, dim=-1),
         raw_covariance=scatter(raw),
-        raw_support=raw.weights > 0,
-        objective=sq_scale.double() ** size,
-        singular=raw.ellipsoid.singular,
+        raw_support=(raw.weights > 0).t(),
+        log_det=log_values(sq_scale.double() ** size),
+        exact_fit=raw.ellipsoid.singular,
+        valid=torch.ones_like(raw.ellipsoid.singular),
     )
 
 

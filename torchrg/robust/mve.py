@@ -10,6 +10,7 @@ from torchrg.robust.lanes import (
     covariance_entries,
     determinant,
     fit_ellipsoid,
+    log_values,
     smallest_points,
     sorted_points,
     sq_distances,
@@ -17,7 +18,6 @@ from torchrg.robust.lanes import (
 from torchrg.robust.patches import RobustFit, fit_patchwise, patchwise
 from torchrg.robust.starts import draw_seed, elemental_sets
 from torchrg.robust.weights import (
-    Estimate,
     chi2_quantile,
     consistency_factor,
     quantile_factor,
@@ -72,7 +72,7 @@ def fit_mve(
         raise ConfigError(f"fit_mve: expected num_starts of at least 1, got {num_starts!r}.")
     seed = draw_seed(generator)
 
-    def estimator(columns: list[Tensor], floor: Tensor, size: int) -> Estimate:
+    def estimator(columns: list[Tensor], floor: Tensor, size: int) -> RobustFit:
         num_points, num_coordinates = len(columns[0]), len(columns)
         corners = num_coordinates + 1
         number = comb(num_points, corners) if exhaustive else num_starts
@@ -95,14 +95,15 @@ def fit_mve(
         final_factor = consistency_factor(quantile, num_coordinates)
         final = reweight(columns, distances, quantile, final_factor)
         covariance = covariance_entries(columns, ellipsoid.means, weights, num_coordinates)
-        return Estimate(
+        return RobustFit(
             *final,
-            sq_distances=distances,
+            sq_distances=distances.t(),
             raw_location=torch.stack(ellipsoid.means, dim=-1),
             raw_covariance=covariance * factor[:, None, None],
-            raw_support=covered > 0,
-            objective=best,
-            singular=ellipsoid.singular,
+            raw_support=(covered > 0).t(),
+            log_det=log_values(best),
+            exact_fit=ellipsoid.singular,
+            valid=torch.ones_like(ellipsoid.singular),
         )
 
     return fit_patchwise(

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,15 +16,13 @@ from torchrg.robust.exact import find_flats, refine_flat
 from torchrg.robust.lanes import (
     columns_of_points,
     covariance_entries,
-    map_values,
+    log_values,
     median_points,
     take_lanes,
 )
 from torchrg.robust.scale import sum_points
-from torchrg.robust.weights import Estimate, subset_size
+from torchrg.robust.weights import subset_size
 
-LaneEstimator = Callable[[list[Tensor], Tensor, int], Estimate]
-"""LaneEstimator of lanes in general position: columns ``(K, M)``, minimum variance ``(M,)``, h."""
 PATCHES_IN_CACHE = 4096
 """Number of patches processed at a time, so that their data fits into the cache."""
 _MIN_PATCHES = 64
@@ -89,6 +86,13 @@ class RobustFit(NamedTuple):
         return f"RobustFit({tuple(batch)} patches, {num_points} points, {size} coordinates)"
 
 
+LaneEstimator = Callable[[list[Tensor], Tensor, int], RobustFit]
+"""Estimator of lanes in general position: columns ``(K, M)``, minimum variance ``(M,)``, h.
+
+The fits are in the units of the lanes, with ``log_det`` in float64. Exact fits are those whose
+``raw_support`` lies on a hyperplane."""
+
+
 class _Frame(NamedTuple):
     """Transform from lanes to patches: ``point = (lane / zoom + offset) / unit``.
 
@@ -111,6 +115,18 @@ class _Frame(NamedTuple):
         """Transform scatter matrices ``(B, P, P)`` to the units of their patches."""
         length = (self.zoom * self.unit)[:, None, None]
         return lanes / length / length
+
+    def fit(self, lanes: RobustFit) -> RobustFit:
+        """Transform fits of lanes in general position to the coordinates of their patches."""
+        units = 2 * lanes.location.shape[1] * log_values(self.zoom.double() * self.unit.double())
+        return lanes._replace(
+            location=self.point(lanes.location),
+            covariance=self.matrix(lanes.covariance),
+            raw_location=self.point(lanes.raw_location),
+            raw_covariance=self.matrix(lanes.raw_covariance),
+            log_det=(lanes.log_det - units).to(lanes.location.dtype),
+            exact_fit=~lanes.valid,
+        )
 
 
 def patchwise(function: Callable[Arguments, RobustFit]) -> Callable[Arguments, RobustFit]:
@@ -272,11 +288,11 @@ def _fit_chunk(
     regular = torch.nonzero(dimension == size).squeeze(1)
     if len(regular):
         estimate = estimator(lanes_of(regular), tolerance[regular] ** 2, subset)
-        _store(out, regular, _general_fit(estimate, frame.select(regular)))
+        _store(out, regular, frame.select(regular).fit(estimate))
         # Concentration may find a plane that no simplex lies on.
-        thin = torch.nonzero(estimate.singular).squeeze(1)
+        thin = torch.nonzero(estimate.exact_fit).squeeze(1)
         if len(thin):
-            rows, chosen = regular[thin], estimate.raw_support[:, thin]
+            rows, chosen = regular[thin], estimate.raw_support[thin].t()
             on_plane = refine_flat(lanes_of(rows), chosen, tolerance[rows], size - 1)
             is_exact = on_plane.sum(dim=0) >= enough
             store_exact(rows[is_exact], on_plane[:, is_exact])
@@ -300,27 +316,6 @@ def _fit_chunk(
         rows = lower[flat & ~small]
         store_exact(rows, members[:, rows] | True)
     return out
-
-
-def _general_fit(estimate: Estimate, frame: _Frame) -> RobustFit:
-    """Transform the fit of lanes in general position to patch coordinates."""
-    size = estimate.location.shape[1]
-    units = 2 * size * map_values(np.log, torch.log, frame.zoom.double() * frame.unit.double())
-    valid = torch.ones_like(estimate.singular)
-    return RobustFit(
-        location=frame.point(estimate.location),
-        covariance=frame.matrix(estimate.covariance),
-        support=estimate.support.t(),
-        sq_distances=estimate.sq_distances.t(),
-        raw_location=frame.point(estimate.raw_location),
-        raw_covariance=frame.matrix(estimate.raw_covariance),
-        raw_support=estimate.raw_support.t(),
-        log_det=(map_values(np.log, torch.log, estimate.objective) - units).to(
-            estimate.location.dtype
-        ),
-        exact_fit=~valid,
-        valid=valid,
-    )
 
 
 def _exact_fit(columns: list[Tensor], members: Tensor, frame: _Frame) -> RobustFit:

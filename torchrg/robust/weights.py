@@ -1,7 +1,7 @@
 """Reweighting of raw fits: cutoffs, correction factors and scatter."""
 
 from functools import lru_cache
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -81,24 +81,6 @@ def small_sample_factor(
     return 1 / inverse if inverse > 0 else 1.0
 
 
-class Estimate(NamedTuple):
-    """Fits of M lanes: the fields of :class:`torchrg.robust.RobustFit`, with points on axis 0.
-
-    ``objective`` ``(M,)`` is the minimized determinant, float64; ``singular`` ``(M,)`` marks lanes
-    whose ``raw_support`` lies on a hyperplane.
-    """
-
-    location: Tensor
-    covariance: Tensor
-    support: Tensor
-    sq_distances: Tensor
-    raw_location: Tensor
-    raw_covariance: Tensor
-    raw_support: Tensor
-    objective: Tensor
-    singular: Tensor
-
-
 def quantile_factor(distances: Tensor, size: int, num_coordinates: int) -> Tensor:
     """Factor ``(M,)`` of a scatter, ``d2_(h) / chi2inv(h / n)`` of squared distances ``(K, M)``.
 
@@ -116,7 +98,7 @@ def within_quantile(distances: Tensor, quantile: float, num_coordinates: int) ->
 def reweight(
     columns: list[Tensor], distances: Tensor, quantile: float, factor: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return location, covariance and support of points within a quantile of a raw fit.
+    """Return location, covariance and support ``(M, K)`` of points within a quantile of a raw fit.
 
     The covariance is multiplied by the factor unless all points are included.
     """
@@ -126,15 +108,15 @@ def reweight(
     covariance = covariance_entries(columns, means, weights, (count - 1).clamp(min=1))
     whole = count == len(distances)
     covariance = torch.where(whole[:, None, None], covariance, covariance * factor)
-    return torch.stack(means, dim=-1), covariance, weights > 0
+    return torch.stack(means, dim=-1), covariance, (weights > 0).t()
 
 
 def distances_to_support(
     columns: list[Tensor], support: Tensor, factor: float, floor: Tensor
 ) -> Tensor:
     """Squared distances ``(K, M)`` to the mean and covariance that :func:`reweight` returned."""
-    weights = support.to(floor.dtype)
+    weights = support.t().to(floor.dtype)
     count = sum_points(weights)
     ellipsoid = fit_ellipsoid(columns, weights, count.clamp(min=1), floor)
-    scale = torch.where(count == len(support), torch.ones_like(floor), factor)
+    scale = torch.where(count == len(weights), torch.ones_like(floor), factor)
     return sq_distances(ellipsoid, (count - 1).clamp(min=1) / scale)
