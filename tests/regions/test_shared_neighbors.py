@@ -35,20 +35,20 @@ def test_counts_equal_those_of_sets(kind, max_distance, monkeypatch):
     counted = torch.ones(len(points), 12).bool() if max_distance is None else neighbors.valid
     for min_shared in (0, 1, 6, 9, 12):
         for rows in (slice(0, 50), slice(50, len(points))):
-            found = connected_neighbors(neighbors, rows, counted[rows], min_shared)
+            found = connected_neighbors(neighbors, min_shared, rows, counted[rows])
             assert torch.equal(found, (expected(neighbors, min_shared) & counted)[rows])
 
 
 def test_long_lists_do_not_overflow_the_counter():
     neighbors = Neighbors(torch.arange(300).expand(300, 300))
     everyone = torch.ones(300, 300, dtype=torch.bool)
-    assert connected_neighbors(neighbors, slice(0, 300), everyone, 300).all()
+    assert connected_neighbors(neighbors, 300, slice(0, 300), everyone).all()
 
 
 def test_only_edges_that_were_asked_for_are_answered():
     neighbors = Neighbors(torch.arange(4).expand(4, 4))
     asked = torch.eye(4, dtype=torch.bool)
-    assert torch.equal(connected_neighbors(neighbors, slice(0, 4), asked, 2), asked)
+    assert torch.equal(connected_neighbors(neighbors, 2, slice(0, 4), asked), asked)
 
 
 def test_the_fraction_is_the_decimal_that_was_written():

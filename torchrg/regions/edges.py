@@ -85,13 +85,15 @@ def mark_edges(
     is_global = config.seed_rule == "curvature" and config.curvature_scope == "cloud"
     order_independent = is_global and not has_late_promotion(config)
     num_points, k = cloud.neighbors.indices.shape
-    min_shared = min_shared_neighbors(config.connectivity or 0.0, k)
+    test = None
+    if config.connectivity is not None:
+        min_shared = min_shared_neighbors(config.connectivity, k)
+        test = partial(connected_neighbors, cloud.neighbors, min_shared)
     joins = np.zeros((num_points, 8 * -(-k // 64)), dtype=np.uint8)
     seeds = joins if order_independent else np.zeros_like(joins)
 
     def mark(rows: slice) -> None:
-        test = partial(connected_neighbors, cloud.neighbors, rows, min_shared=min_shared)
-        connect = None if config.connectivity is None else test
+        connect = None if test is None else partial(test, rows)
         accepted, connected = accept_edges(cloud, config, rows, connect)
         _write_bits(joins[rows], accepted)
         if not order_independent:

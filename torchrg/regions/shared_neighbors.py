@@ -26,7 +26,7 @@ def min_shared_neighbors(connectivity: float, k: int) -> int:
 
 
 def connected_neighbors(
-    neighbors: Neighbors, rows: slice, candidates: Tensor, min_shared: int
+    neighbors: Neighbors, min_shared: int, rows: slice, candidates: Tensor
 ) -> Tensor:
     """Return a mask of the edges between points that share ``min_shared`` neighbors, eq. (10).
 
