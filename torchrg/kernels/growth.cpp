@@ -212,7 +212,7 @@ KERNEL line_cells(int64_t num_points, int64_t num_edges, int64_t num_pairs, int6
   return DONE;
 }
 
-// shared_neighbors.SharedNeighbors.connected: whether both ends of edges from rows `first` on have
+// shared_neighbors.connected_neighbors: whether both ends of edges from rows `first` on have
 // `min_shared` common neighbors. Neighbor lists of a block of rows are bit sets over its members.
 // `numbers` may be uninitialized: a number is valid only if the member with that number matches.
 KERNEL connected(int64_t num_points, int64_t k, int64_t num_rows, Ints indices, Flagged mask,

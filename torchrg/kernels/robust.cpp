@@ -184,13 +184,13 @@ SEPARATE Lanes majority_difference(const Column& rows, int n) {
     if (is_any(open & (within <= below))) round = larger(round, NUM_WINDOWS);
     Flags searched = open & (below < wanted) & (within > wanted);
     Bracket inside = bracket;
-    Lanes least = inside.low;
+    Lanes minimum = inside.low;
     for (int turn = 0; is_any(searched) && turn < MAX_TURNS; turn++) {
       const Lanes number = inside.many - inside.few, part = (wanted - inside.few) / number;
       const bool has_window = window.size >= 0, bisects = turn % 2;
       if (!has_window && !is_any(searched & (number >= MAX_DIFFERENCES / LANES))) break;
       const Lanes fraction = bisects && !(has_window && turn < FREE_TURNS) ? all(0.5f) : part;
-      Lanes next = larger(inside.low + (inside.high - inside.low) * fraction, least);
+      Lanes next = larger(inside.low + (inside.high - inside.low) * fraction, minimum);
       next = where(next < inside.high, next, inside.low);
       const Around around = window.look_around(rows, n, next);
       const Lanes found = to_float(around.count);
@@ -199,7 +199,7 @@ SEPARATE Lanes majority_difference(const Column& rows, int n) {
       result = where(done, where(is_few, around.above, around.below), result);
       open = open & ~done, searched = searched & ~done;
       inside.narrow(where(is_few, next, around.below), found);
-      least = where(is_few, around.above, least);
+      minimum = where(is_few, around.above, minimum);
     }
     if (window.size < 0) bracket = inside;
   }
