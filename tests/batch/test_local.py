@@ -129,6 +129,7 @@ def test_a_process_that_cannot_start_is_a_limit_of_the_system(
 @pytest.mark.skipif(sys.platform != "linux", reason="forks on Linux only")
 def test_only_a_process_of_one_thread_forks():
     script = """
+import time
 import torchrg.__main__
 from threading import Event, Thread
 from torchrg.batch.local import _context
@@ -137,6 +138,8 @@ done = Event()
 Thread(target=done.wait).start()
 print(_context().get_start_method())
 done.set()
+Thread(target=time.sleep, args=(0.02,)).start()
+print(_context().get_start_method())
 """
     printed = subprocess.run([sys.executable, "-c", script], capture_output=True, check=True)
-    assert printed.stdout.decode().split() == ["fork", "spawn"]
+    assert printed.stdout.decode().split() == ["fork", "spawn", "fork"]

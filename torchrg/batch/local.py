@@ -5,8 +5,10 @@ import gc
 import os
 import signal
 import sys
+import time
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
+from importlib import import_module
 from multiprocessing import connection, get_context, parent_process, resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkContext, SpawnContext
@@ -29,6 +31,8 @@ CHILD_ENVIRONMENT = dict.fromkeys(
 no imports from the working directory."""
 _STDERR = 2
 """File descriptor of standard error."""
+_NUM_LOOKS = 100
+"""Maximum number of milliseconds in which an ended thread leaves the list of the system."""
 _MAX_CAUSE_LENGTH = 300
 """Maximum characters of a worker's last message in a report; a few lines of a terminal."""
 
@@ -160,11 +164,14 @@ class _Worker:
 def _context() -> ForkContext | SpawnContext:
     """Return how workers start: forked, with all modules loaded, if no other thread is running.
 
-    A forked process lacks the other threads and would wait for their locks. System libraries of
-    macOS do not work after a fork.
+    A forked process lacks the other threads and would wait for their locks. A thread that has just
+    ended is listed for a moment. System libraries of macOS do not work after a fork.
     """
-    if sys.platform == "linux" and len(list(Path("/proc/self/task").iterdir())) == 1:
-        return get_context("fork")
+    for _ in range(_NUM_LOOKS if sys.platform == "linux" else 0):
+        if len(list(Path("/proc/self/task").iterdir())) == 1:
+            import_module("scipy.spatial")  # Once for all workers.
+            return get_context("fork")
+        time.sleep(0.001)
     return get_context("spawn")
 
 
@@ -238,8 +245,7 @@ def _environment() -> Iterator[None]:
     try:
         yield
     finally:
-        for name in CHILD_ENVIRONMENT.keys() - original.keys():
-            del os.environ[name]
+        os.environ.clear()
         os.environ.update(original)
 
 

@@ -25,7 +25,7 @@ from torchrg._parallel import (
     split_rows,
 )
 from torchrg.errors import ConfigError, ShapeError
-from torchrg.neighbors.blocks import search_blocks
+from torchrg.neighbors.blocks import build_tree, search_blocks
 from torchrg.neighbors.order import canonical_order, distinct_rows, mark_distinct
 from torchrg.structures import MAX_POINTS, AnyCloud, Neighbors
 from torchrg.structures.points import Rows, bounding_box
@@ -252,13 +252,11 @@ def search_nearest(
     Points and queries are finite, ``(N, 3)`` and ``(M, 3)`` in the same coordinates. Ties go to the
     first point in :func:`canonical_order`.
     """
-    from scipy.spatial import cKDTree
-
     nearest = np.full(len(queries), -1)
     if len(points) == 0 or len(queries) == 0:
         return nearest
     first = distinct_rows(as_tensor("search_nearest", "points", points)).numpy()
-    tree = cKDTree(points[first], balanced_tree=False, compact_nodes=False)
+    tree = build_tree(points[first])
     # Consecutive close queries use the same cached parts of the tree.
     query_rows = canonical_order(queries).numpy()
     for chunk in split_rows(len(query_rows), ROWS_AT_ONCE):
@@ -286,10 +284,8 @@ def prepare_search(points: NDArray[np.floating], k: int) -> SomeNeighbors:
 
     ``points`` ``(N, 3)`` are distinct and in canonical order, at least ``k``.
     """
-    from scipy.spatial import cKDTree
-
     positions = points.astype(np.float64, copy=False)
-    tree = cKDTree(positions, balanced_tree=False, compact_nodes=False)
+    tree = build_tree(positions)
     return lambda rows: _query(tree, positions[rows], k)[1]
 
 
@@ -307,8 +303,6 @@ def search_rows(
     added to each neighbor. Rows outside ``query_rows`` may be searched or not. The tree holds each
     distinct position once, so that duplicates cost nothing.
     """
-    from scipy.spatial import cKDTree
-
     k = indices.shape[1]
     columns = as_tensor("search_knn", "points", points).unbind(dim=1)
     starts = np.flatnonzero(mark_distinct(*columns).numpy())
@@ -331,10 +325,8 @@ def search_rows(
             resolved = np.setdiff1d(requested, pending, assume_unique=True)
             for chunk in split_rows(len(resolved), limit_rows(ROWS_IN_CACHE, k)):
                 store(resolved[chunk], found[resolved[chunk]])
-    if len(pending) == 0:
-        return
     width = min(k, len(positions))
-    tree = cKDTree(positions, balanced_tree=False, compact_nodes=False)
+    tree = build_tree(positions) if len(pending) else None
     for chunk in split_rows(len(pending), limit_rows(CHUNK_SIZE, width)):
         store(pending[chunk], _query(tree, positions[pending[chunk]], width)[1])
 

@@ -68,11 +68,9 @@ def canonical_order(points: AnyCloud, ties: Sequence[Tensor] = ()) -> Tensor:
 
 def finite_rows(points: Tensor, ties: Sequence[Tensor] = ()) -> Tensor:
     """Return the rows of the finite points ``(N, 3)`` in :func:`canonical_order`, int64."""
-    x, y, z = points.isfinite().unbind(dim=-1)
-    is_finite = x & y & z
-    if bool(is_finite.all()):
+    if len(points) == 0 or bool(torch.stack(points.aminmax()).isfinite().all()):
         return canonical_order(points, ties)
-    rows = nonzero_rows(is_finite)
+    rows = nonzero_rows(points.isfinite().all(dim=-1))
     return rows[canonical_order(points[rows], [column[rows] for column in ties])]
 
 

@@ -80,8 +80,8 @@ def describe_steps(
     is_single = points.dtype == np.float32
     if not is_single and scale == 0:
         return ""
-    is_finite = np.logical_and.reduce(np.isfinite(points.T))
-    finite = points if is_finite.all() else points[is_finite]
+    is_finite = np.isfinite([points.min(initial=0), points.max(initial=0)]).all()
+    finite = points if is_finite else points[np.isfinite(points).all(axis=1)]
     if len(finite) < 3:
         return ""
     with np.errstate(over="ignore", invalid="ignore"):
