@@ -168,7 +168,8 @@ def _reach_of_boxes(
     firsts = inside[boxes.starts[indices] - boxes.starts[indices.start]]
     # Each other point of the box is at most its diagonal away from the first.
     reach: NDArray[np.float64] = build_tree(inside).query(firsts, [k])[0][:, 0]
-    return reach + np.linalg.norm(boxes.high[indices] - boxes.low[indices], axis=1)
+    reach += np.linalg.norm(boxes.high[indices] - boxes.low[indices], axis=1)
+    return reach
 
 
 def build_tree(points: NDArray[np.floating]) -> Any:  # noqa: ANN401
