@@ -207,7 +207,7 @@ def _test(title: str, cloud: Tensor, axes: tuple[int, int]) -> Case:
     limit = coplanarity_limits(residuals, floor)
     every = torch.ones_like(residuals, dtype=torch.bool)
     min_shared = min_shared_neighbors(settings_.growing.connectivity, settings_.normals.k)
-    connective = connected_neighbors(Neighbors(neighbors.indices), min_shared, one, every)
+    connective = connected_neighbors(Neighbors(neighbors.indices), min_shared, [], one, every)
     return Case(
         title,
         axes,

@@ -96,8 +96,9 @@ def test_cells_and_tree_together_find_the_neighbors_of_every_point(kind):
 @pytest.mark.skipif(not needs_library, reason="needs the library of kernels")
 def test_no_tree_is_built_where_cells_resolve_every_point(monkeypatch):
     trees = []
-    monkeypatch.setattr("scipy.spatial.cKDTree", lambda points, **_: trees.append(points))
-    for kind in ("room", "exact grid", "far from the origin"):
+    monkeypatch.setattr("torchrg.neighbors.knn._MIN_FOR_CELLS", 1)
+    monkeypatch.setattr("torchrg.neighbors.knn.build_tree", trees.append)
+    for kind in ("room", "exact grid", "grid with rounding"):
         search_knn(torch.from_numpy(cloud_of(kind)[0]), 20)
     assert trees == []
 

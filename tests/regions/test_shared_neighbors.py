@@ -33,22 +33,23 @@ def test_counts_equal_those_of_sets(kind, max_distance, monkeypatch):
     points = growing_clouds.prepare(growing_clouds.KINDS[kind](np.random.default_rng(0)), 12)[0]
     neighbors = search_knn(points, 12, max_distance=max_distance, canonical=True)
     counted = torch.ones(len(points), 12).bool() if max_distance is None else neighbors.valid
+    spare = []
     for min_shared in (0, 1, 6, 9, 12):
         for rows in (slice(0, 50), slice(50, len(points))):
-            found = connected_neighbors(neighbors, min_shared, rows, counted[rows])
+            found = connected_neighbors(neighbors, min_shared, spare, rows, counted[rows])
             assert torch.equal(found, (expected(neighbors, min_shared) & counted)[rows])
 
 
 def test_long_lists_do_not_overflow_the_counter():
     neighbors = Neighbors(torch.arange(300).expand(300, 300))
     everyone = torch.ones(300, 300, dtype=torch.bool)
-    assert connected_neighbors(neighbors, 300, slice(0, 300), everyone).all()
+    assert connected_neighbors(neighbors, 300, [], slice(0, 300), everyone).all()
 
 
 def test_only_edges_that_were_asked_for_are_answered():
     neighbors = Neighbors(torch.arange(4).expand(4, 4))
     asked = torch.eye(4, dtype=torch.bool)
-    assert torch.equal(connected_neighbors(neighbors, 2, slice(0, 4), asked), asked)
+    assert torch.equal(connected_neighbors(neighbors, 2, [], slice(0, 4), asked), asked)
 
 
 def test_the_fraction_is_the_decimal_that_was_written():

@@ -76,8 +76,8 @@ class Arguments:
     for this command (ray), that of this machine (auto), or the address of one, as HOST:PORT, where
     ROOT and OUT have the same paths on every node."""
     limit_memory: float | None = None
-    """Memory limit for all concurrent scans, in GB; the largest arrays of a larger scan go to disk
-    (TMPDIR or OUT). Default: 80 % of the free memory."""
+    """Memory limit for all concurrent scans, in GB; larger ones use the disk. Default: 80 % of the
+    free memory."""
     table: str | None = None
     """Name of a plane table in the folder of each scan, besides planes.json, such as planes.csv;
     see torchrg segment --table."""

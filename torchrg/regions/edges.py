@@ -88,7 +88,7 @@ def mark_edges(
     test = None
     if config.connectivity is not None:
         min_shared = min_shared_neighbors(config.connectivity, k)
-        test = partial(connected_neighbors, cloud.neighbors, min_shared)
+        test = partial(connected_neighbors, cloud.neighbors, min_shared, [])
     joins = np.zeros((num_points, 8 * -(-k // 64)), dtype=np.uint8)
     seeds = joins if order_independent else np.zeros_like(joins)
 

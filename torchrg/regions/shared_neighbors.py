@@ -26,12 +26,13 @@ def min_shared_neighbors(connectivity: float, k: int) -> int:
 
 
 def connected_neighbors(
-    neighbors: Neighbors, min_shared: int, rows: slice, candidates: Tensor
+    neighbors: Neighbors, min_shared: int, spare: list[Tensor], rows: slice, candidates: Tensor
 ) -> Tensor:
     """Return a mask of the edges between points that share ``min_shared`` neighbors, eq. (10).
 
     Only edges in the mask ``candidates`` from the points ``rows`` are tested, shape ``(n, K)``,
-    bool; all other edges are False. Each point is in its own list.
+    bool; all other edges are False. Each point is in its own list. ``spare`` keeps working memory
+    for the next call, initially empty; concurrent calls take different parts.
 
     The lists of a block of points are rows of a matrix with one column per member, i.e. per point
     in any list. The product of two rows counts their common neighbors. Lists of points outside the
@@ -41,9 +42,14 @@ def connected_neighbors(
     if min_shared <= 0:
         return candidates.clone()
     if kernels.serve(*neighbors, candidates, k=candidates.shape[1]):
-        numbers = torch.empty_like(neighbors.indices[:, 0])
+        try:
+            numbers = spare.pop()
+        except IndexError:
+            numbers = torch.empty_like(neighbors.indices[:, 0])
         edges = *neighbors, candidates, numbers, rows.start, min_shared
-        return kernels.call("connected", *edges)[0]
+        (connected,) = kernels.call("connected", *edges)
+        spare.append(numbers)
+        return connected
     size = _BLOCK_SIZE if candidates.device.type == "cpu" else _DEVICE_BLOCK_SIZE
 
     def count(block: slice) -> Tensor:
