@@ -245,7 +245,8 @@ def _environment() -> Iterator[None]:
     try:
         yield
     finally:
-        os.environ.clear()
+        for name in CHILD_ENVIRONMENT.keys() - original.keys():
+            del os.environ[name]
         os.environ.update(original)
 
 

@@ -14,7 +14,7 @@ struct Column {
   INLINE_MEMBER void set_half(int j, int lane, FourFloats four) {
     __builtin_memcpy(values + j * LANES + lane, &four, sizeof four);
   }
-  // Replaces lanes by those of another column, or by one of its lanes.
+  // Replaces lanes by the same lanes of another column, or by one lane of it.
   INLINE_MEMBER void replace(Flags lanes, const Column& other, int n) {
     for (int k = 0; k < n; k++) set(k, where(lanes, other[k], (*this)[k]));
   }
