@@ -98,7 +98,7 @@ def _split_voxels(points: Tensor, size: float) -> Iterator[tuple[Tensor, list[Te
     axis, num_slabs = int(num_cells.argmax()), -(-len(points) // _POINTS_AT_ONCE)
     some = slice(None, None, -(-len(points) // _SAMPLE_SIZE))
     ordered = points[some, axis][is_finite[some]].double().sort().values
-    borders = ordered[:: -(-len(ordered) // num_slabs) or 1][1:].sub(low[axis]).div_(size).floor_()
+    borders = ordered[:: -(-len(ordered) // num_slabs) or 1][1:].sub(low[axis]).div_(size)
     slab = torch.empty(len(points), dtype=torch.int16, device=points.device)
     for part in parts:
         cell = points[part, axis].double().sub(low[axis]).div_(size).floor_()
