@@ -8,7 +8,7 @@ import torch
 
 from tests.kernels.clouds import needs_library
 from torchrg.neighbors import search_knn
-from torchrg.neighbors.knn import search_cells
+from torchrg.neighbors.knn import build_grids, prepare_search, search_grids
 from torchrg.scenes import make_room
 
 SIZE = 1000
@@ -78,8 +78,9 @@ def test_what_cells_answer_is_what_all_distances_say(kind, k, monkeypatch):
     monkeypatch.setattr("torchrg.neighbors.knn._MIN_FOR_CELLS", 1)
     points, _, rows = cloud_of(kind)
     found = np.empty((len(points), k), dtype=np.int32)
-    left = search_cells(points, np.arange(len(points)), found)
-    answered = np.setdiff1d(np.arange(len(points)), left)
+    requested = np.arange(len(points))
+    left = search_grids(build_grids(points, requested, k), requested, found, requested)
+    answered = np.setdiff1d(requested, left)
     np.testing.assert_array_equal(found[answered], rows[answered, :k])
     if kind == "surface" and k > 2:
         assert len(left) < 0.1 * len(points)
@@ -99,7 +100,10 @@ def test_no_tree_is_built_where_cells_resolve_every_point(monkeypatch):
     monkeypatch.setattr("torchrg.neighbors.knn._MIN_FOR_CELLS", 1)
     monkeypatch.setattr("torchrg.neighbors.knn.build_tree", trees.append)
     for kind in ("room", "exact grid", "grid with rounding"):
-        search_knn(torch.from_numpy(cloud_of(kind)[0]), 20)
+        points, _, rows = cloud_of(kind)
+        search_knn(torch.from_numpy(points), 20)
+        some = np.array([7, 3, 7])
+        np.testing.assert_array_equal(prepare_search(points, 20)(some), rows[some, :20])
     assert trees == []
 
 

@@ -42,7 +42,7 @@ SIGNATURES = {
     "morton_codes": "d[N3] x x x x -> l[N]",
     "sort_integers": "l[N] -> l[N] l[N] l[N] l[N]",
     "fill_cells": "d[N3] I[C] n n x x x x -> i[N] i[N] d[N3]",
-    "search_cells": "d[N3] i[N] i[C] b[N] l[N]? I[Mk] B[N] n n n n n x x x x -> ",
+    "search_cells": "d[N3] i[N] i[C] I[N] l[N]? I[Mk] n n n n n x x x x -> ",
     "pass_edges": "f[3N] f[3N] b[N] f[N]? i[nk] b[nk]? x x n -> b[nk]",
     "neighbor_chords": "f[3N] i[nk] -> f[nk]",
     "grow_regions": "i[Nk] l[Nw] l[Nw]? b[N]? b[N] i[n] n I[N] I[N] -> ",

@@ -179,11 +179,11 @@ KERNEL fill_cells(int64_t num_points, int64_t num_cells, const double* points, i
   return DONE;
 }
 
-// Writes the k nearest neighbors of the selected points in cells `from` to `to` to their rows of
-// `found`, renumbered by `order` if given; `certain` marks exact results.
+// Writes the k nearest neighbors of points in cells `from` to `to` to their rows of `found`, their
+// targets, and sets resolved targets to -1, for no request. `order` renumbers neighbors if given.
 KERNEL search_cells(int64_t num_points, int64_t num_cells, int64_t num_lists, int64_t k,
-                    const double* sorted, Ints rows, Ints starts, Flagged selected, Longs order,
-                    int32_t* found, bool* certain, int64_t from, int64_t to, int64_t width,
+                    const double* sorted, Ints rows, Ints starts, int32_t* targets, Longs order,
+                    int32_t* found, int64_t from, int64_t to, int64_t width,
                     int64_t height, int64_t first_row, double x, double y, double z, double size) {
   if (k < 1 || k > MAX_WIDTH || from < 0 || to > num_cells - 1) return TOO_WIDE;
   if (width < 1 || height < 1 || width > num_cells || height > num_cells) return TOO_WIDE;
@@ -196,7 +196,7 @@ KERNEL search_cells(int64_t num_points, int64_t num_cells, int64_t num_lists, in
     for (int64_t position = starts[c]; position < starts[c + 1]; position++) {
       if (position < 0 || position >= num_points || !is_row(rows[position], num_points))
         return NO_SUCH_ROW;
-      is_empty &= !selected[rows[position]];
+      is_empty &= targets[rows[position]] < 0;
     }
     if (is_empty) continue;
     int64_t number = 0, first[9], length[9];
@@ -221,7 +221,7 @@ KERNEL search_cells(int64_t num_points, int64_t num_cells, int64_t num_lists, in
                  v = y + (double(c / height % width) - 0.5) * size;
     for (int64_t position = starts[c]; position < starts[c + 1]; position++) {
       const int32_t row = rows[position];
-      if (!selected[row]) continue;
+      if (targets[row] < 0) continue;
       const double *query = sorted + 3 * position, px = query[0], py = query[1], pz = query[2];
       for (int t = 0; t < n; t++) {
         const double a = all.x[t] - px, b = all.y[t] - py, d = all.z[t] - pz;
@@ -242,9 +242,8 @@ KERNEL search_cells(int64_t num_points, int64_t num_cells, int64_t num_lists, in
           break;
       }
       if (count < k || count > MAX_CHOSEN) continue;
-      const int64_t to_row = order ? order[row] : row;
-      if (to_row < 0 || to_row >= num_lists) return NO_SUCH_ROW;
-      int32_t* list = found + k * to_row;
+      if (targets[row] >= num_lists) return NO_SUCH_ROW;
+      int32_t* list = found + k * targets[row];
       sort(all, count, within);
       const double farthest = square_root(all.square[all.sorted[k - 1]]);
       // Whether a point outside could tie with the last neighbor by rounding.
@@ -253,7 +252,7 @@ KERNEL search_cells(int64_t num_points, int64_t num_cells, int64_t num_lists, in
         const int32_t near = all.row[all.sorted[j]];
         list[j] = int32_t((order ? order[near] : int64_t(near)) + first_row);
       }
-      certain[row] = true;
+      targets[row] = -1;
       guess = float(farthest * farthest * 1.2);
     }
   }

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -285,8 +286,21 @@ def prepare_search(points: NDArray[np.floating], k: int) -> SomeNeighbors:
     ``points`` ``(N, 3)`` are distinct and in canonical order, at least ``k``.
     """
     positions = points.astype(np.float64, copy=False)
-    tree = build_tree(positions)
-    return lambda rows: _query(tree, positions[rows], k)[1]
+    grids = list(build_grids(positions, np.arange(len(points)), k))
+    # Usually not built: grids resolve all rows.
+    tree = cache(lambda: build_tree(positions))
+
+    @sequential_operations()
+    def search(rows: NDArray[np.integer]) -> NDArray[np.integer]:
+        requested, places = np.unique(rows, return_inverse=True)
+        found = np.empty((len(requested), k), dtype=np.int32)
+        pending = search_grids(grids, requested, found, np.arange(len(requested)))
+        if len(pending):
+            at = np.searchsorted(requested, pending)
+            found[at] = _query(tree(), positions[pending], k)[1]
+        return found[places]
+
+    return search
 
 
 @sequential_operations()
@@ -316,75 +330,102 @@ def search_rows(
 
     first, last = np.searchsorted(starts, (query_rows.start, query_rows.stop - 1), side="right") - 1
     pending = np.arange(first, last + 1)
-    if len(positions) >= _MIN_FOR_CELLS and kernels.serve(k=k):
-        if len(positions) == len(points):
-            pending = search_cells(positions, pending, indices, order, first_row)
-        else:
-            found, requested = np.empty((len(positions), k), dtype=np.int32), pending
-            pending = search_cells(positions, requested, found)
-            resolved = np.setdiff1d(requested, pending, assume_unique=True)
-            for chunk in split_rows(len(resolved), limit_rows(ROWS_IN_CACHE, k)):
-                store(resolved[chunk], found[resolved[chunk]])
+    grids = build_grids(positions, pending, k)
+    if len(positions) == len(points):
+        targets = pending if order is None else order[pending]
+        pending = search_grids(grids, pending, indices, targets, order, first_row)
+    else:
+        found, requested = np.empty((len(positions), k), dtype=np.int32), pending
+        pending = search_grids(grids, requested, found, requested)
+        resolved = np.setdiff1d(requested, pending, assume_unique=True)
+        for chunk in split_rows(len(resolved), limit_rows(ROWS_IN_CACHE, k)):
+            store(resolved[chunk], found[resolved[chunk]])
     width = min(k, len(positions))
     tree = build_tree(positions) if len(pending) else None
     for chunk in split_rows(len(pending), limit_rows(CHUNK_SIZE, width)):
         store(pending[chunk], _query(tree, positions[pending[chunk]], width)[1])
 
 
-def search_cells(
-    points: NDArray[np.float64],
+class _Grid(NamedTuple):
+    """Points sorted by the cells of a grid around their bounding box.
+
+    Coordinates and rows of the sorted points; first point of each cell, then the number of points;
+    cells along y and z, lower corner x, y, z, and cell size.
+    """
+
+    positions: Tensor
+    rows: Tensor
+    starts: Tensor
+    shape: tuple[int, int, float, float, float, float]
+
+
+def build_grids(points: NDArray[np.float64], rows: NDArray[np.int64], k: int) -> Iterator[_Grid]:
+    """Yield grids that together resolve nearly all k nearest of some rows, small cells first.
+
+    ``points`` ``(N, 3)`` are distinct and in canonical order. Without kernels, and for few points,
+    for which a tree is faster, there are none.
+    """
+    if len(points) < _MIN_FOR_CELLS or not kernels.serve(k=k):
+        return
+    low, high = bounding_box(points)
+    max_cells = min(max(_MAX_CELLS_PER_POINT * len(points), 2**20), MAX_POINTS - 1)
+    positions = torch.from_numpy(np.ascontiguousarray(points))
+    for size in _cell_sizes(points, rows, k):
+        counts = (high - low) / size + 4
+        if counts.prod() > max_cells:
+            continue
+        length, width, height = (int(count) for count in counts)
+        starts = torch.empty(length * width * height + 1, dtype=torch.int32, device="cpu")
+        shape = (width, height, *low.tolist(), size)
+        sorted_rows, _, sorted_positions = kernels.call("fill_cells", positions, starts, *shape)
+        yield _Grid(sorted_positions, sorted_rows, starts, shape)
+
+
+def search_grids(
+    grids: Iterable[_Grid],
     rows: NDArray[np.int64],
     found: NDArray[np.int32],
+    targets: NDArray[np.int64],
     order: NDArray[np.int64] | None = None,
     first_row: int = 0,
 ) -> NDArray[np.int64]:
-    """Find the k nearest of distinct points ``(N, 3)`` for the rows that grid cells can resolve.
+    """Find the k nearest points for the rows that grids can resolve.
 
     A cell and its 26 neighbors hold a few hundred points, whose distances a kernel computes. A
     result counts only if no point outside these cells can be nearer. The grid covers the bounding
-    box, including empty cells. The point itself counts. Requires the kernels.
+    box, including empty cells. The point itself counts.
 
     Args:
-        points: Distinct points, in canonical order.
+        grids: The result of :func:`build_grids`.
         rows: Query rows, ascending.
-        found: Output neighbors of each point, ``(M, k)``, sorted by distance, then by row.
-        order: Row of ``found`` for each point, and its index there. Default: the point's row.
+        found: Output neighbors, ``(M, k)``, sorted by distance, then by row.
+        targets: Row of ``found`` for each query row.
+        order: Index of each point in ``found``. Default: the point's row.
         first_row: Offset added to each index.
 
     Returns:
         The unresolved rows, ascending. Their values in ``found`` are undefined.
     """
-    low, high = bounding_box(points)
-    extent = high - low
-    positions = torch.from_numpy(np.ascontiguousarray(points))
-    target, by_row = torch.from_numpy(found), None if order is None else torch.from_numpy(order)
-    certain = torch.zeros(len(points), dtype=torch.bool, device="cpu")
-    is_query = torch.zeros_like(certain)
-    for size in _cell_sizes(points, rows, found.shape[1]):
-        if len(rows) == 0:
-            break
-        counts = extent / size + 4
-        if counts.prod() > min(max(_MAX_CELLS_PER_POINT * len(points), 2**20), MAX_POINTS - 1):
-            continue
-        _, width, height = (int(count) for count in counts)
-        starts = torch.empty(int(counts[0]) * width * height + 1, dtype=torch.int32, device="cpu")
-        shape = width, height, *low.tolist(), size
-        sorted_rows, _, sorted_positions = kernels.call("fill_cells", positions, starts, *shape)
-        is_query.zero_()[torch.from_numpy(rows)] = True
+    lists, by_row = torch.from_numpy(found), None if order is None else torch.from_numpy(order)
+    pending = np.empty(0, dtype=np.int32)
+    for grid in grids:
+        if len(pending) == 0:
+            pending = np.full(len(grid.rows), -1, dtype=np.int32)
+            pending[rows] = targets
+        requested = torch.from_numpy(pending)
         # Tasks of about this many points each.
-        ends = np.arange(ROWS_IN_CACHE, len(points), ROWS_IN_CACHE)
-        bounds = [1, *np.searchsorted(starts.numpy(), ends, side="right").tolist(), len(starts) - 1]
+        ends = np.arange(ROWS_IN_CACHE, len(pending), ROWS_IN_CACHE)
+        cells = np.searchsorted(grid.starts.numpy(), ends, side="right").tolist()
+        bounds = [1, *cells, len(grid.starts) - 1]
 
-        def work(
-            cells: tuple[int, int],
-            shape: tuple[float, ...] = shape,
-            grid: tuple[Tensor, ...] = (sorted_positions, sorted_rows, starts),
-        ) -> None:
-            numbers = *cells, *shape[:2], first_row, *shape[2:]
-            kernels.call("search_cells", *grid, is_query, by_row, target, certain, *numbers)
+        def work(cells: tuple[int, int], grid: _Grid = grid, requested: Tensor = requested) -> None:
+            numbers = *cells, *grid.shape[:2], first_row, *grid.shape[2:]
+            kernels.call("search_cells", *grid[:3], requested, by_row, lists, *numbers)
 
         map_tasks(work, list(itertools.pairwise(bounds)), torch.device("cpu"))
-        rows = rows[~certain.numpy()[rows]]
+        rows = rows[pending[rows] >= 0]
+        if len(rows) == 0:
+            break
     return rows
 
 
