@@ -10,10 +10,11 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrg._parallel import ROWS_AT_ONCE, split_rows
+from torchrg._parallel import ROWS_AT_ONCE, map_tasks, split_rows
 from torchrg.errors import PrecisionWarning, UnitWarning, warn
 
 _COARSE, _COARSE_GRID = 0.1, 0.5
@@ -109,9 +110,12 @@ def is_fine_step(step: float, points: NDArray[np.floating]) -> bool:
 def _middle_half(points: NDArray[np.floating]) -> NDArray[np.float64]:
     """Return the lowest and highest coordinates of the middle half of points, shape ``(2, 3)``."""
     ranks = [int(fraction * (len(points) - 1)) for fraction in _QUARTILES]
-    # One column at a time takes a third of the time of np.quantile.
-    ends = [np.partition(column, ranks)[ranks] for column in points.T]
-    return np.array(ends, dtype=np.float64).T
+
+    def work(axis: int) -> NDArray[np.floating]:
+        # A column takes a third of the time of np.quantile.
+        return np.partition(points[:, axis], ranks)[ranks]
+
+    return np.array(map_tasks(work, range(3), torch.device("cpu")), dtype=np.float64).T
 
 
 def describe_placeholders(points: NDArray[np.floating]) -> str:
