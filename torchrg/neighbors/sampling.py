@@ -68,10 +68,10 @@ def measure_sampling(points: AnyCloud, neighbors: Neighbors | SomeNeighbors) -> 
     radius, first = distances[:, -1], distances[:, 1]
     density = k / (math.pi * float(np.median(radius)) ** 2)
     variation = float(first.std() / first.mean())
-    exact = _deviations(patches[:, :_NEAREST]) <= _EXACT * distances[:, _NEAREST - 1]
+    exact = _deviations(patches[..., :_NEAREST]) <= _EXACT * distances[:, _NEAREST - 1]
     flatness = _deviations(patches) / radius
     flat = flatness <= np.median(flatness)
-    small = np.median(_deviations(patches[flat, :_SMALL]))
+    small = np.median(_deviations(patches[flat, :, :_SMALL]))
     rows = rows[flat]
     # The list of a point may already contain its nearest hundred.
     extended = lists_of(rows)
@@ -95,7 +95,7 @@ def _nearest(
     """Return the nearest distinct positions in lists ``(n, L)``, starting with the point itself.
 
     Returns the rows with at least the median number of positions, up to ``max_count``, the
-    ascending distances, and the positions relative to the point.
+    ascending distances, and the positions relative to the point, ``(n, 3, count)``.
     """
     lists = np.sort(lists, axis=1)
     is_first = np.diff(lists, axis=1, prepend=-1) > 0
@@ -115,14 +115,14 @@ def _nearest(
     is_chosen = counts >= count
     order = distances[is_chosen].argsort(axis=1, kind="stable")[:, :count]
     near = [np.take_along_axis(v[is_chosen], order, axis=1) for v in (distances, *positions)]
-    return rows[is_chosen], near[0], np.stack(near[1:], axis=2)
+    return rows[is_chosen], near[0], np.stack(near[1:], axis=1)
 
 
 def _deviations(patches: FloatArray) -> FloatArray:
-    """Return RMS distances of points ``(n, k, 3)`` to their plane, k - 3 degrees of freedom."""
-    centered = patches - patches.mean(axis=1, keepdims=True)
-    moments = np.linalg.eigvalsh(centered.swapaxes(1, 2) @ centered)
-    deviation: FloatArray = np.sqrt(np.maximum(moments[:, 0], 0) / max(patches.shape[1] - 3, 1))
+    """Return RMS distances of points ``(n, 3, k)`` to their plane, k - 3 degrees of freedom."""
+    centered = patches - patches.mean(axis=2, keepdims=True)
+    moments = np.linalg.eigvalsh(centered @ centered.swapaxes(1, 2))
+    deviation: FloatArray = np.sqrt(np.maximum(moments[:, 0], 0) / max(patches.shape[2] - 3, 1))
     return deviation
 
 
