@@ -433,9 +433,10 @@ def _cell_sizes(points: NDArray[np.float64], rows: NDArray[np.int64], k: int) ->
     """Return ascending cell sizes that together resolve nearly all of some rows."""
     sample, width = rows[:: -(-len(rows) // _SAMPLE_SIZE)], min(_WINDOW * k, len(points))
     starts = np.clip(sample - width // 2, 0, len(points) - width)
-    offsets = points[starts[:, None] + np.arange(width)] - points[sample, None]
-    squares = np.partition((offsets * offsets).sum(axis=2), k - 1, axis=1)[:, k - 1]
-    reach = np.sqrt(np.sort(squares[squares > 0]))
+    window = starts[:, None] + np.arange(width)
+    squares = sum(np.square(column[window] - column[sample, None]) for column in points.T)
+    farthest = np.partition(squares, k - 1, axis=1)[:, k - 1]
+    reach = np.sqrt(np.sort(farthest[farthest > 0]))
     sizes: list[float] = []
     min_count = int(_MIN_FRACTION * len(reach))
     while len(reach) > min_count:
