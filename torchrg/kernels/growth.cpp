@@ -3,6 +3,9 @@
 
 namespace {
 
+constexpr int64_t AHEAD = 8;                    // seeds in the queue whose lists are loaded early
+constexpr int64_t LINE = 64 / sizeof(int32_t);  // numbers in a line of the cache
+
 // 1 with the sign of each lane.
 INLINE Lanes sign_of(Lanes values) {
   constexpr int32_t ONE = 0x3F800000;  // the bits of 1
@@ -108,15 +111,21 @@ KERNEL grow_regions(int64_t num_points, int64_t k, int64_t num_words, int64_t nu
     for (int claims = 0; claims <= late; claims++)
       for (int64_t head = 0; head < count; head++) {
         const int64_t seed = queue[head];
+        if (head + AHEAD < count)
+          for (int64_t t = 0; t < k; t += LINE)
+            __builtin_prefetch(indices + queue[head + AHEAD] * k + t);
         for (int64_t word = 0; word < num_words; word++) {
-          uint64_t edges = joins[seed * num_words + word];
+          const int32_t* list = indices + seed * k + 64 * word;
+          const int64_t length = smaller(k - 64 * word, int64_t(64));
+          if (!are_rows(list, length, num_points)) return NO_SUCH_ROW;
+          uint64_t edges = joins[seed * num_words + word], unclaimed = 0;
+          for (int64_t bit = 0; bit < length; bit++)
+            unclaimed |= uint64_t(roots[list[bit]] < 0) << bit;
           const uint64_t promoting = makes_seed ? makes_seed[seed * num_words + word] : 0;
           if (late) edges &= claims ? ~promoting : promoting;
-          for (; edges; edges &= edges - 1) {
+          for (edges &= unclaimed; edges; edges &= edges - 1) {
             const int bit = __builtin_ctzll(edges);
-            if (64 * word + bit >= k) return TOO_WIDE;
-            const int32_t target = indices[seed * k + 64 * word + bit];
-            if (!is_row(target, num_points)) return NO_SUCH_ROW;
+            const int32_t target = list[bit];
             if (roots[target] >= 0 || !valid[target]) continue;
             roots[target] = root;
             if (claims) continue;
