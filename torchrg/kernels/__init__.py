@@ -41,7 +41,7 @@ SIGNATURES = {
     "fit_paraboloids": "f[N3] i[Nk] b[Nk]? f[N3] l[n] x -> f[n3] f[n] f[n]",
     "morton_codes": "d[N3] x x x x -> l[N]",
     "sort_integers": "l[N] -> l[N] l[N] l[N] l[N]",
-    "fill_cells": "d[N3] I[C] n n x x x x -> i[N] i[N] d[N3]",
+    "fill_cells": "d[N3] I[C] n n x x x x -> i[N] i[N]",
     "search_cells": "d[N3] i[N] i[C] I[N] l[N]? I[Mk] n n n n n x x x x -> ",
     "pass_edges": "f[3N] f[3N] b[N] f[N]? i[nk] b[nk]? x x n -> b[nk]",
     "neighbor_chords": "f[3N] i[nk] -> f[nk]",

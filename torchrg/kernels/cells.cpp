@@ -155,7 +155,7 @@ KERNEL sort_integers(int64_t n, Longs keys, int64_t* rows, int64_t* sorted, int6
 // Sorts points by cell: `starts` receives the first index of each cell, then the end.
 KERNEL fill_cells(int64_t num_points, int64_t num_cells, const double* points, int32_t* starts,
                   int64_t width, int64_t height, double x, double y, double z, double size,
-                  int32_t* rows, int32_t* cells, double* sorted) {
+                  int32_t* rows, int32_t* cells) {
   if (num_points > INT32_MAX || num_cells > INT32_MAX) return TOO_WIDE;  // rows and cells: int32
   if (width < 1 || height < 1 || width > num_cells || height > num_cells) return TOO_WIDE;
   const double length = double(num_cells / (width * height));
@@ -171,18 +171,14 @@ KERNEL fill_cells(int64_t num_points, int64_t num_cells, const double* points, i
   }
   int32_t before = 0;
   for (int64_t c = 0; c < num_cells; c++) before += starts[c], starts[c] = before;
-  for (int64_t i = num_points - 1; i >= 0; i--) {
-    const int64_t position = --starts[cells[i]];
-    rows[position] = int32_t(i);
-    for (int axis = 0; axis < 3; axis++) sorted[3 * position + axis] = points[3 * i + axis];
-  }
+  for (int64_t i = num_points - 1; i >= 0; i--) rows[--starts[cells[i]]] = int32_t(i);
   return DONE;
 }
 
 // Writes the k nearest neighbors of points in cells `from` to `to` to their rows of `found`, their
 // targets, and sets resolved targets to -1, for no request. `order` renumbers neighbors if given.
 KERNEL search_cells(int64_t num_points, int64_t num_cells, int64_t num_lists, int64_t k,
-                    const double* sorted, Ints rows, Ints starts, int32_t* targets, Longs order,
+                    const double* points, Ints rows, Ints starts, int32_t* targets, Longs order,
                     int32_t* found, int64_t from, int64_t to, int64_t width,
                     int64_t height, int64_t first_row, double x, double y, double z, double size) {
   if (k < 1 || k > MAX_WIDTH || from < 0 || to > num_cells - 1) return TOO_WIDE;
@@ -212,8 +208,8 @@ KERNEL search_cells(int64_t num_points, int64_t num_cells, int64_t num_lists, in
     for (int g = 0; g < 9; g++) {
       if (!are_rows(rows + first[g], length[g], num_points)) return NO_SUCH_ROW;
       for (int64_t t = first[g]; t < first[g] + length[g]; t++, n++) {
-        all.x[n] = sorted[3 * t], all.y[n] = sorted[3 * t + 1], all.z[n] = sorted[3 * t + 2];
-        all.row[n] = rows[t];
+        const double* p = points + 3 * int64_t(rows[t]);
+        all.x[n] = p[0], all.y[n] = p[1], all.z[n] = p[2], all.row[n] = rows[t];
       }
     }
     for (int t = n; t < padded(n); t++) all.key[t] = INFINITE;
@@ -222,7 +218,7 @@ KERNEL search_cells(int64_t num_points, int64_t num_cells, int64_t num_lists, in
     for (int64_t position = starts[c]; position < starts[c + 1]; position++) {
       const int32_t row = rows[position];
       if (targets[row] < 0) continue;
-      const double *query = sorted + 3 * position, px = query[0], py = query[1], pz = query[2];
+      const double *query = points + 3 * int64_t(row), px = query[0], py = query[1], pz = query[2];
       for (int t = 0; t < n; t++) {
         const double a = all.x[t] - px, b = all.y[t] - py, d = all.z[t] - pz;
         all.square[t] = a * a + b * b + d * d, all.key[t] = float(all.square[t]);

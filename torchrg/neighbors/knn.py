@@ -347,13 +347,13 @@ def search_rows(
 
 
 class _Grid(NamedTuple):
-    """Points sorted by the cells of a grid around their bounding box.
+    """Points in the cells of a grid around their bounding box.
 
-    Coordinates and rows of the sorted points; first point of each cell, then the number of points;
+    Their coordinates, and rows by cell; first of these of each cell, then the number of points;
     cells along y and z, lower corner x, y, z, and cell size.
     """
 
-    positions: Tensor
+    points: Tensor
     rows: Tensor
     starts: Tensor
     shape: tuple[int, int, float, float, float, float]
@@ -377,8 +377,8 @@ def build_grids(points: NDArray[np.float64], rows: NDArray[np.int64], k: int) ->
         length, width, height = (int(count) for count in counts)
         starts = torch.empty(length * width * height + 1, dtype=torch.int32, device="cpu")
         shape = (width, height, *low.tolist(), size)
-        sorted_rows, _, sorted_positions = kernels.call("fill_cells", positions, starts, *shape)
-        yield _Grid(sorted_positions, sorted_rows, starts, shape)
+        sorted_rows, _ = kernels.call("fill_cells", positions, starts, *shape)
+        yield _Grid(positions, sorted_rows, starts, shape)
 
 
 def search_grids(
