@@ -7,7 +7,6 @@ it, are separated by :func:`split_levels`.
 
 from collections.abc import Callable
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,6 +16,7 @@ from torchrg.config import GrowingConfig
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.linalg.angles import deg_to_sq_chord, sq_chords
 from torchrg.linalg.moments import Segments, sum_neighbors
+from torchrg.neighbors.components import connected_components
 from torchrg.regions.adjacency import PARALLEL_DEG, KnnAdjacency
 from torchrg.regions.edges import GrowingInput, accept_edges, within_angle
 from torchrg.regions.fit import MAX_FITTED, RegionPlanes, fit_planes, fit_regions
@@ -105,7 +105,7 @@ def cut_bridges(
     ones form one core.
 
     ``labels`` ``(N,)`` are 0 to M-1 or :data:`torchrg.UNLABELED`, ``planes`` the planes of the
-    regions. The returned labels may have gaps; ``labels`` itself is returned if no core grows.
+    regions. The returned labels may have gaps; ``labels`` itself is returned if none is split.
     """
     rows, others, on_plane = _find_mixed(cloud, labels, planes, int(config.min_size))
     cores = torch.full_like(labels, UNLABELED)
@@ -124,6 +124,10 @@ def cut_bridges(
     aligned = others[turn <= deg_to_sq_chord(_CORE_FRACTION * config.max_angle_deg)]
     cores[aligned] = labels[aligned] + int(cores.max()) + 1
     cores = remove_small(cores, 1)
+    members = torch.cat([rows, aligned])
+    owner = labels.new_empty(int(cores.max()) + 1).index_copy_(0, cores[members], labels[members])
+    if not bool((torch.bincount(owner) > 1).any()):
+        return labels
     narrow = cores.to(torch.int32)
 
     def meets_other(chunk: Tensor) -> Tensor:
@@ -133,6 +137,8 @@ def cut_bridges(
     rows = rows[torch.cat([meets_other(chunk) for chunk in torch.split(rows, chunk_size)])]
     cores = _join_cores(cloud, cores, *_find_edges(cloud, labels, config, rows, chunk_size))
     cores, split = _join_curved(cloud, labels, cores, on_plane)
+    if not bool(split.any()):
+        return labels
     plane_of = torch.full_like(split, UNLABELED, dtype=torch.int64)
     plane_of[labels[aligned]] = cores[aligned]
     free = value_of_points(split, labels, False)
@@ -173,6 +179,9 @@ def _join_curved(
     """
     segments = Segments(cores, max_points=MAX_FITTED)
     owner, num_points = segments.first(labels), segments.sizes
+    split = torch.bincount(owner, minlength=len(on_plane)) > 1
+    if bool(on_plane[split].all()):
+        return cores, split
     flat = ~fit_planes(segments, cloud.points, cloud.normals).curved
     of_region = torch.bincount(labels + 1, minlength=len(on_plane) + 1)[1:]
     covered = torch.zeros_like(of_region).index_add_(0, owner, num_points * flat)
@@ -252,28 +261,20 @@ def _join_cores(cloud: GrowingInput, cores: Tensor, near: Neighbors, passed: Ten
     num_cores, theirs = int(cores.max()) + 1, near.gather(cores)
     ours = theirs[:, :1].expand_as(theirs)
     between = near.mask() & (theirs >= 0) & (theirs != ours)
+    if not bool(between.any()):
+        return cores
     first, second = ours[between], theirs[between]
     keys = torch.minimum(first, second) * num_cores + torch.maximum(first, second)
     keys, indices = torch.unique(keys, return_inverse=True)
     pairs = torch.stack([keys // num_cores, keys % num_cores], dim=1)
     num_edges = torch.bincount(indices, minlength=len(pairs))
     num_open = torch.bincount(indices[passed[between]], minlength=len(pairs))
-    planes = fit_planes(Segments(cores, max_points=MAX_FITTED), cloud.points, cloud.normals)
-    turn = unsigned_angle_deg(*planes.normal[pairs].unbind(dim=1))
-    joined = (pairwise_misfit(planes, pairs) < _MAX_MISFIT) & (turn <= _MAX_DIHEDRAL_DEG)
-    joined |= num_open >= _MIN_OPEN_FRACTION * num_edges
-    return remap_labels(cores, _components(num_cores, *pairs[joined].unbind(dim=1)))
-
-
-def _components(num_nodes: int, first: Tensor, second: Tensor) -> Tensor:
-    """Return the connected component of each node ``(n,)`` of a graph with edges ``(E,)``."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    ends = first.numpy(force=True), second.numpy(force=True)
-    graph = coo_array((np.ones(len(first), np.int8), ends), shape=(num_nodes, num_nodes))
-    owner = connected_components(graph, directed=False)[1]
-    return torch.from_numpy(owner).to(first.device, torch.int64)
+    joined = num_open >= _MIN_OPEN_FRACTION * num_edges
+    if not bool(joined.all()):
+        planes = fit_planes(Segments(cores, max_points=MAX_FITTED), cloud.points, cloud.normals)
+        turn = unsigned_angle_deg(*planes.normal[pairs].unbind(dim=1))
+        joined |= (pairwise_misfit(planes, pairs) < _MAX_MISFIT) & (turn <= _MAX_DIHEDRAL_DEG)
+    return remap_labels(cores, connected_components(num_cores, *pairs[joined].unbind(dim=1)))
 
 
 def _propagate(cores: Tensor, near: Neighbors, passed: Tensor) -> Tensor:
@@ -339,19 +340,28 @@ def _find_levels(
     limit, group = _SEED_NOISE_FACTOR * noise, region
     for _ in range(2):
         is_beyond = average.abs() > value_of_points(limit, group, torch.inf)
-        level = group = connected_points(level.where(is_beyond, UNLABELED), nearest)
+        found = connected_points(level.where(is_beyond, UNLABELED), nearest)
+        level = group = remove_small(found, int(config.min_size))
         segments = Segments(level)
         step = segments.median(segments.gather(residual).abs())
         limit = step / 2
     owner = segments.first(region)
     min_step = (_STEP_NOISE_FACTOR * noise[owner]).clamp(min=float(config.facet_tolerance or 0.0))
-    kept = (segments.counts >= int(config.min_size)) & (step >= min_step)
-    level, step, owner = keep_regions(level, kept), step[kept], owner[kept]
-    fits = fit_planes(Segments(level), cloud.points, cloud.normals)
-    turn = unsigned_angle_deg(fits.normal, planes.normal[owner])
-    kept = (turn <= PARALLEL_DEG) & (fits.thickness <= _MAX_THICKNESS * step)
-    kept &= _have_valleys(level, step, average, region, adjacency)
-    return keep_regions(level, kept), owner[kept]
+    level, step, owner = _keep_levels(step >= min_step, level, step, owner)
+    if len(owner):
+        has_valley = _have_valleys(level, step, average, region, adjacency)
+        level, step, owner = _keep_levels(has_valley, level, step, owner)
+    if len(owner):
+        fits = fit_planes(Segments(level), cloud.points, cloud.normals)
+        turn = unsigned_angle_deg(fits.normal, planes.normal[owner])
+        is_plane = (turn <= PARALLEL_DEG) & (fits.thickness <= _MAX_THICKNESS * step)
+        level, owner = _keep_levels(is_plane, level, owner)
+    return level, owner
+
+
+def _keep_levels(kept: Tensor, level: Tensor, *values: Tensor) -> tuple[Tensor, ...]:
+    """Return the level of each point and values of levels ``(L,)`` for the ``kept`` ones alone."""
+    return keep_regions(level, kept), *(column[kept] for column in values)
 
 
 def _measure_residuals(
@@ -409,9 +419,11 @@ def connected_points(groups: Tensor, nearest: Tensor) -> Tensor:
     rows = nonzero_rows(groups >= 0)
     near, index = nearest[rows].long(), torch.full_like(groups, UNLABELED)
     index[rows] = torch.arange(len(rows), device=rows.device)
-    joined = groups[near] == groups[rows, None]
-    ends = index[rows, None].expand_as(near)[joined], index[near][joined]
-    return index.index_copy_(0, rows, _components(len(rows), *ends))
+    own = index[rows, None].expand_as(near)
+    # A link of a point to itself joins nothing.
+    ends = torch.where(groups[near] == groups[rows, None], index[near], own)
+    found = connected_components(len(rows), own.reshape(-1), ends.view(-1))
+    return index.index_copy_(0, rows, found)
 
 
 def _have_valleys(
