@@ -236,8 +236,15 @@ def are_coplanar(
     # |(p_j - p_i) . n_i|, below eq. (10).
     residuals = project(offsets, cloud.normals[indices[:, 0].long()]).abs_()
     floor = floor_fraction * patch_radii(offsets, counted)
-    limits = coplanarity_limits(residuals, floor, counted if compared is None else compared[tested])
-    result[tested] = (residuals <= limits[:, None]) & mask[tested]
+    if compared is not None:
+        counted = compared[tested]
+    # The limit is at least twice the floor.
+    far = mask[tested] & ~(residuals <= 2 * floor[:, None])
+    rows = nonzero_rows(far.any(dim=1))
+    counted = None if counted is None else counted[rows]
+    limits = coplanarity_limits(residuals[rows], floor[rows], counted)
+    far[rows] &= ~(residuals[rows] <= limits[:, None])
+    result[tested] = mask[tested] & ~far
     return result
 
 
