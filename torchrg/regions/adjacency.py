@@ -113,12 +113,17 @@ def find_adjacency(
 
 
 class KnnAdjacency:
-    """Adjacency of a point cloud: up to 8 nearest neighbors per point."""
+    """Adjacency of a point cloud: up to 8 nearest neighbors per point.
+
+    The boundary and the contacts of the last labels are kept.
+    """
 
     def __init__(self, neighbors: Neighbors) -> None:
         valid = None if neighbors.valid is None else neighbors.valid[:, _NEAREST]
         self._all, self.neighbors = neighbors, Neighbors(neighbors.indices[:, _NEAREST], valid)
         self._points = neighbors.indices[:, :1]
+        self._boundary: tuple[Tensor, Tensor] | None = None
+        self._contacts: tuple[Tensor, tuple[Tensor, Tensor]] | None = None
 
     def neighbor_rows(self, rows: Rows) -> Tensor:
         """Return the neighbors of the given points, shape ``(n, 8)``, padded with the point."""
@@ -127,23 +132,29 @@ class KnnAdjacency:
 
     def contacts(self, labels: Tensor) -> tuple[Tensor, Tensor]:
         """Apply :func:`find_region_pairs` to the nearest neighbors."""
-        return find_region_pairs(labels, self._all, _NEAREST)
+        if self._contacts is None or self._contacts[0] is not labels:
+            rows = self.boundary(labels)
+            labeled = rows[labels[rows] >= 0].to(torch.int32)
+            edges = _RegionEdges(labels, self._all, _NEAREST, labeled)
+            self._contacts = labels, (edges.pairs, edges.counts)
+        return self._contacts[1]
 
     def boundary(self, labels: Tensor) -> Tensor:
         """Return the points with a nearest neighbor in another region, also unlabeled points."""
-        rows = torch.arange(len(labels), dtype=torch.int32, device=labels.device)
-        return _boundary_rows(rows, labels.to(torch.int32), self._all, _NEAREST).long()
+        if self._boundary is None or self._boundary[0] is not labels:
+            rows = torch.arange(len(labels), dtype=torch.int32, device=labels.device)
+            found = _boundary_rows(rows, labels.to(torch.int32), self._all, _NEAREST)
+            self._boundary = labels, found.long()
+        return self._boundary[1]
 
 
-def find_region_pairs(
-    labels: Tensor, neighbors: Neighbors, columns: slice = slice(None)
-) -> tuple[Tensor, Tensor]:
+def find_region_pairs(labels: Tensor, neighbors: Neighbors) -> tuple[Tensor, Tensor]:
     """Return pairs of adjacent regions and the number of edges between them.
 
-    For labels ``(N,)``, negative if unlabeled, and some columns of the lists: pairs ``(E, 2)``,
-    smaller label first, ascending, and counts ``(E,)``.
+    For labels ``(N,)``, negative if unlabeled: pairs ``(E, 2)``, smaller label first, ascending,
+    and counts ``(E,)``.
     """
-    edges = _RegionEdges(labels, neighbors, columns)
+    edges = _RegionEdges(labels, neighbors)
     return edges.pairs, edges.counts
 
 
@@ -160,15 +171,24 @@ class _RegionEdges:
     """Edges between regions, recomputed on each pass: storing all could take more than the cloud.
 
     ``pairs`` ``(E, 2)`` are the adjacent regions, ascending, and ``counts`` ``(E,)`` their edges.
+    Edges start at the points ``rows`` ``(n,)``, int32, by default all, and lead to some columns.
     """
 
-    def __init__(self, labels: Tensor, neighbors: Neighbors, columns: slice = slice(None)) -> None:
+    def __init__(
+        self,
+        labels: Tensor,
+        neighbors: Neighbors,
+        columns: slice = slice(None),
+        rows: Tensor | None = None,
+    ) -> None:
         # int32 indexing is three times faster.
         self._labels, self._neighbors, self._columns = labels.to(torch.int32), neighbors, columns
         self._num_regions = max(int(labels.max()) + 1, 1) if len(labels) else 1
         self._at_once = limit_rows(ROWS_IN_CACHE, neighbors.indices.shape[1])
-        labeled = nonzero_rows(self._labels >= 0).to(torch.int32)
-        self._rows = _boundary_rows(labeled, self._labels, neighbors, columns)
+        if rows is None:
+            labeled = nonzero_rows(self._labels >= 0).to(torch.int32)
+            rows = _boundary_rows(labeled, self._labels, neighbors, columns)
+        self._rows = rows
         chunks = torch.split(self._rows, self._at_once)
         keys = torch.cat([self._find(rows)[3].clone() for rows in chunks])
         if self._num_regions**2 <= len(labels):

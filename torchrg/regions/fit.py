@@ -154,10 +154,10 @@ def _fit_chunk(
         mean_normal, spread = mean_normals(segments, normals)
     else:
         mean_normal, spread = shared.double(), torch.zeros_like(shared[:, 0])
-    origin = segments.first(points).double()
+    first = segments.first(points)
+    origin, resolution = first.double(), coordinate_resolution(first).double()
     local = segments.gather_centered(points, origin)
     weights = torch.ones_like(local[0])
-    resolution = coordinate_resolution(segments.first(points)).double()
     for _ in range(_NUM_FITS):
         mean, covariance = segments.moments(local, weights)
         variances, axes = eigh3_lapack(covariance)
@@ -247,13 +247,15 @@ class RegionFits:
 def _plane_normals(variances: Tensor, axes: Tensor, mean_normal: Tensor) -> Tensor:
     """Return plane normals, using the mean normals where the points are degenerate."""
     low, middle, high = variances.unbind(dim=1)
+    is_flat = middle > _FLAT_RATIO * low
+    if bool(is_flat.all()):
+        return axes[:, :, 0]
     along = axes[:, :, 2]
     is_line = high > _FLAT_RATIO * middle
     component = (mean_normal * along).sum(dim=1, keepdim=True) * along
     across = mean_normal - torch.where(is_line[:, None], component, 0.0)
     length = across.norm(dim=1, keepdim=True)
     across = torch.where(length > 0, across / length, axes[:, :, 0])
-    is_flat = middle > _FLAT_RATIO * low
     return torch.where(is_flat[:, None], axes[:, :, 0], across)
 
 

@@ -92,8 +92,8 @@ def refine_regions(
         # The plane of a bent region does not show where the region ends.
         vague = planes.bent | (planes.num_points < MIN_FITTED)
         reach = torch.where(vague, torch.nan, planes.scale_thickness(config.absorb_reach))
-        labels = refine_borders(cloud, labels, planes, reach)
-        labels = assign_levels(cloud, labels, planes)
+        labels = refine_borders(cloud, adjacency, labels, planes, reach)
+        labels = assign_levels(cloud, adjacency, labels, planes)
         if config.facet_tolerance is not None:
             # A gap narrower than a neighborhood may divide a faceted surface. With white noise,
             # growth crosses it on one plane: regions still apart, such as cushions side by side,
@@ -109,6 +109,8 @@ def _remove_inconsistent(
 ) -> Tensor:
     """Remove small regions with inconsistent normals; the labels may then have gaps."""
     small = torch.bincount(labels + 1, minlength=1)[1:] < int(config.min_size)
+    if not bool(small.any()):
+        return labels
     segments = Segments(torch.where(value_of_points(small, labels, False), labels, UNLABELED))
     ours = segments.gather_columns(cloud.normals)
     theirs = [segments.broadcast(column) for column in normal.unbind(dim=1)]
@@ -294,8 +296,8 @@ def _merge(
 ) -> Tensor:
     """Merge regions in contact whose :func:`_misfit` is at most ``tolerance``."""
     pairs = contacts[0][contacts[1] >= MIN_CONTACTS].cpu()
-    groups = _Moments(*(values.cpu().clone() for values in moments))
-    adjacent: list[set[int]] = [set() for _ in groups.weight]
+    groups = _Moments(*(values.cpu() for values in moments))
+    adjacent: list[set[int]] = [set() for _ in range(len(groups.weight))]
     owner, age = torch.arange(len(adjacent)), [0] * len(adjacent)
     queue: list[tuple[float, int, int, int, int]] = []
 
@@ -310,6 +312,9 @@ def _merge(
                 heapq.heappush(queue, (misfit, a, b, age[a], age[b]))
 
     offer(pairs)
+    if not queue:
+        return labels
+    groups = _Moments(*(values.clone() for values in groups))
     while queue:
         _, a, b, *ages = heapq.heappop(queue)
         if [age[a], age[b]] != ages:
@@ -369,7 +374,11 @@ def _misfit(
 
 
 def refine_borders(
-    cloud: GrowingInput, labels: Tensor, planes: RegionPlanes, reach: Tensor
+    cloud: GrowingInput,
+    adjacency: KnnAdjacency,
+    labels: Tensor,
+    planes: RegionPlanes,
+    reach: Tensor,
 ) -> Tensor:
     """Reassign boundary points to the region that explains them best.
 
@@ -383,14 +392,16 @@ def refine_borders(
     to a nearer plane.
 
     ``reach`` ``(M,)`` is the maximum point-to-plane distance, NaN for regions that are not flat,
-    which are left unchanged.
+    which are left unchanged. If no point moves, ``labels`` itself is returned.
     """
     flat = torch.cat([reach.isfinite(), reach.new_ones(1, dtype=torch.bool)])
-    return _reassign(cloud, labels, planes, flat, partial(_choose_regions, cloud, planes, reach))
+    choose = partial(_choose_regions, cloud, planes, reach)
+    return _reassign(cloud, adjacency, labels, planes, flat, choose)
 
 
 def _reassign(
     cloud: GrowingInput,
+    adjacency: KnnAdjacency,
     labels: Tensor,
     planes: RegionPlanes,
     movable: Tensor,
@@ -403,11 +414,10 @@ def _reassign(
     Only valid points of ``movable`` regions are passed, ``(M + 1,)``, the last entry for unlabeled
     points.
     """
-    adjacency = KnnAdjacency(cloud.neighbors)
+    unchanged, rows = labels, adjacency.boundary(labels)
     # int32 is faster to index and to compare.
     labels = labels.to(torch.int32, copy=True)
-    rows = adjacency.boundary(labels)
-    for _ in range(_MAX_PASSES):
+    for number in range(_MAX_PASSES):
         rows = rows[movable[labels[rows]] & cloud.valid[rows]]
         near = adjacency.neighbor_rows(rows)
 
@@ -420,14 +430,16 @@ def _reassign(
         chosen = torch.cat(map_chunks(work, len(rows), ROWS_IN_CACHE, labels.device))
         moved = chosen != labels[rows]
         if not bool(moved.any()):
-            break
+            return labels.long() if number else unchanged
         rows = rows[moved]
         labels[rows] = chosen[moved]
         rows = torch.unique(torch.cat([rows, near[moved].flatten()]))
     return labels.long()
 
 
-def assign_levels(cloud: GrowingInput, labels: Tensor, planes: RegionPlanes) -> Tensor:
+def assign_levels(
+    cloud: GrowingInput, adjacency: KnnAdjacency, labels: Tensor, planes: RegionPlanes
+) -> Tensor:
     """Reassign boundary points of parallel regions to the nearer plane.
 
     The planes must be 1.5 thicknesses apart at the point, so that parts of one surface are
@@ -445,6 +457,8 @@ def assign_levels(cloud: GrowingInput, labels: Tensor, planes: RegionPlanes) -> 
         usable = usable[:, both] & (turn <= PARALLEL_DEG)
         other, min_cost = _lowest(torch.where(usable, distance[:, both], torch.inf), options)
         found = nonzero_rows(min_cost.isfinite())
+        if len(found) == 0:
+            return label
         both, other = both[found], other[found]
         pair = torch.stack([label[both], other], dim=1)
         group = group[:, both].T.contiguous()
@@ -460,7 +474,7 @@ def assign_levels(cloud: GrowingInput, labels: Tensor, planes: RegionPlanes) -> 
         moved &= offset[:, 0, 1].abs() <= _LEVEL_REACH * planes.thickness[other]
         return label.index_copy(0, both[moved], other[moved])
 
-    return _reassign(cloud, labels, planes, flat, choose)
+    return _reassign(cloud, adjacency, labels, planes, flat, choose)
 
 
 def _choose_regions(
@@ -486,6 +500,12 @@ def _choose_regions(
     choice = torch.where(remains, label, first)
 
     both = nonzero_rows(second_cost.isfinite() & ~remains)
+    angle = unsigned_angle_deg(planes.normal[first[both]], planes.normal[second[both]])
+    is_kept = (angle <= PARALLEL_DEG) & (label[both] >= 0)
+    choice[both] = torch.where(is_kept, label[both], choice[both])
+    both = both[~is_kept]
+    if len(both) == 0:
+        return choice
     rows, label, pair = rows[both], label[both], (first[both], second[both])
     position, lists = cloud.points[rows], cloud.neighbors.select(rows)
     members = torch.where(lists.mask(), lists.gather(labels), UNLABELED)
@@ -495,27 +515,24 @@ def _choose_regions(
     costs = []
     for one, other in (pair, pair[::-1]):
         height = planes.signed_distances(position, one)
-        over = _overshoot(planes, position, columns, members == one[:, None], (one, other))
+        foot = position - height[:, None] * planes.normal[one]
+        over = _overshoot(planes, foot, columns, members == one[:, None], (one, other))
         excess = (height.square() + over.square()) / scale.square()
         costs.append(excess + _ROUNDING**2 * (one != label))
-    better = torch.where(costs[1] < costs[0], pair[1], pair[0])
-    angle = unsigned_angle_deg(planes.normal[pair[0]], planes.normal[pair[1]])
-    keeps_label = (angle <= PARALLEL_DEG) & (label >= 0)
-    choice[both] = torch.where(keeps_label, label, better)
-    return choice
+    return choice.index_copy(0, both, torch.where(costs[1] < costs[0], pair[1], pair[0]))
 
 
 def _overshoot(
     planes: RegionPlanes,
-    position: Tensor,
+    foot: Tensor,
     columns: list[Tensor],
     inside: Tensor,
     pair: tuple[Tensor, Tensor],
 ) -> Tensor:
     """Return how far the projections of points lie beyond the plane at which their region ends.
 
-    ``columns`` are the coordinates of the neighbors ``(n, K)``, ``inside`` masks those in the
-    region. A ``pair`` is the region and the other plane.
+    ``foot`` ``(n, 3)`` are the projections, ``columns`` are the coordinates of the neighbors ``(n,
+    K)``, ``inside`` masks those in the region. A ``pair`` is the region and the other plane.
     """
     (label, other), offset = pair, torch.zeros_like(columns[0])
     plane = planes.center[other].T, planes.normal[other].T
@@ -525,7 +542,5 @@ def _overshoot(
     total = offset.sum(dim=1)
     rounding = _ROUNDING * planes.thickness[label] * inside.sum(dim=1)
     one_sided = total.abs() > (_MIN_ONE_SIDED * offset.abs().sum(dim=1)).clamp(min=rounding)
-    height = planes.signed_distances(position, label)[:, None]
-    foot = position - height * planes.normal[label]
     over = -total.sign() * planes.signed_distances(foot, other)
     return torch.where(one_sided, over.clamp(min=0), 0.0)
