@@ -168,7 +168,9 @@ class _Contacts(NamedTuple):
 
 
 class _RegionEdges:
-    """Edges between regions, recomputed on each pass: storing all could take more than the cloud.
+    """Edges between regions, found again on each pass: storing all could take more than the cloud.
+
+    Those of a single chunk of points are kept.
 
     ``pairs`` ``(E, 2)`` are the adjacent regions, ascending, and ``counts`` ``(E,)`` their edges.
     Edges start at the points ``rows`` ``(n,)``, int32, by default all, and lead to some columns.
@@ -184,13 +186,14 @@ class _RegionEdges:
         # int32 indexing is three times faster.
         self._labels, self._neighbors, self._columns = labels.to(torch.int32), neighbors, columns
         self._num_regions = max(int(labels.max()) + 1, 1) if len(labels) else 1
-        self._at_once = limit_rows(ROWS_IN_CACHE, neighbors.indices.shape[1])
+        at_once = limit_rows(ROWS_IN_CACHE, neighbors.indices.shape[1])
         if rows is None:
             labeled = nonzero_rows(self._labels >= 0).to(torch.int32)
             rows = _boundary_rows(labeled, self._labels, neighbors, columns)
-        self._rows = rows
-        chunks = torch.split(self._rows, self._at_once)
-        keys = torch.cat([self._find(rows)[3].clone() for rows in chunks])
+        self._chunks = torch.split(rows, at_once)
+        self._kept = self._find(rows) if len(self._chunks) == 1 else None
+        chunk_keys = [self._find(chunk)[3].clone() for chunk in self._chunks if not self._kept]
+        keys = self._kept[3] if self._kept else torch.cat(chunk_keys)
         if self._num_regions**2 <= len(labels):
             # A table of all pairs is faster than a sort.
             table = torch.bincount(keys)
@@ -223,12 +226,11 @@ class _RegionEdges:
         """Yield the results of ``work`` for all edges in order, one chunk of points at a time."""
 
         def find(rows: Tensor) -> Returned:
-            *edges, keys = self._find(rows)
+            *edges, keys = self._kept or self._find(rows)
             return work(_Contacts(self._index(keys), *edges))
 
-        chunks = torch.split(self._rows, self._at_once)
-        for batch in split_rows(len(chunks), _CHUNKS_AT_ONCE):
-            yield from map_tasks(find, chunks[batch], self._rows.device)
+        for batch in split_rows(len(self._chunks), _CHUNKS_AT_ONCE):
+            yield from map_tasks(find, self._chunks[batch], self._labels.device)
 
 
 def _boundary_rows(rows: Tensor, labels: Tensor, neighbors: Neighbors, columns: slice) -> Tensor:

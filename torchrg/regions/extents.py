@@ -57,16 +57,16 @@ def fit_rectangles(segments: Segments, u: Tensor, v: Tensor) -> Rectangles:
     return Rectangles(table[:, :, 0], table[:, :, 1:3], table[:, :, 3])
 
 
-def _min_rectangle(positions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return length, direction and center of the long and the short side, shape ``(2, 4)``."""
+def _min_rectangle(positions: NDArray[np.float64]) -> list[tuple[float, ...]]:
+    """Return length, direction and center of the long and the short side, four numbers each."""
     angle = _min_area_angle(positions)
     cosine, sine = math.cos(angle), math.sin(angle)
-    u, v = positions.T
-    along = np.stack([u * cosine + v * sine, v * cosine - u * sine])
-    low, high = along.min(axis=1), along.max(axis=1)
-    columns = high - low, (cosine, -sine), (sine, cosine), (high + low) / 2
-    rectangle = np.stack(columns, axis=1)
-    return rectangle[::-1] if rectangle[0, 0] < rectangle[1, 0] else rectangle
+    (u, v), sides = positions.T, list[tuple[float, ...]]()
+    for x, y, axis in ((u, v, (cosine, sine)), (v, -u, (-sine, cosine))):
+        along = x * cosine + y * sine
+        low, high = along.min(), along.max()
+        sides.append((high - low, *axis, (high + low) / 2))
+    return sides[::-1] if sides[0][0] < sides[1][0] else sides
 
 
 def _min_area_angle(positions: NDArray[np.float64]) -> float:
@@ -75,8 +75,9 @@ def _min_area_angle(positions: NDArray[np.float64]) -> float:
     The farthest corner in a direction lies between the two hull edges whose angles enclose the
     perpendicular. It is found by a search among the edge angles.
     """
-    corners = positions[_hull_corners(positions)] @ [1, 1j]
-    angles = np.angle(np.roll(corners, -1) - corners)
+    # Adding zero removes its sign, which would turn an angle of 180 degrees.
+    corners = (positions[_hull_corners(positions)] + 0.0).view(np.complex128)[:, 0]
+    angles = np.angle(np.append(corners[1:], corners[0]) - corners)
     order = np.argsort(angles)
     corners, angles = corners[order], angles[order]
     across = (angles + np.pi * _SIDE_TURNS) % (2 * np.pi) - np.pi
@@ -149,6 +150,8 @@ def covered_areas(
     area, width = _corrected_area(cells, segments.counts, size), size
     wide_enough = torch.zeros_like(size, dtype=torch.bool)
     for _ in range(_NUM_DOUBLINGS):
+        if bool(wide_enough.all()):
+            break
         cells = _occupied_cells(cells.owner, cells.row // 2, cells.column // 2, cells.num_cells)
         size = size * 2
         wider = _corrected_area(cells, segments.counts, size)
