@@ -17,14 +17,14 @@ from torchrg.normals.free_space import _free_gaps, cell_width, vote_free_side
 def test_kernel_of_free_gaps_equals_the_definition(sides):
     rng = np.random.default_rng(3)
     cells = np.unique(np.stack([rng.integers(0, side, 5000) for side in sides]), axis=1)
-    cells = (cells - cells.min(axis=1, keepdims=True)).astype(np.int32)
+    cells = torch.from_numpy(cells - cells.min(axis=1, keepdims=True)).int()
     for steps in product((-1, 0, 1), repeat=3):
         if steps > (0, 0, 0):
             found = _free_gaps(cells, steps)
             with definitions():
                 expected = _free_gaps(cells, steps)
             for values, others in zip(found, expected, strict=True):
-                assert np.array_equal(values, others)
+                assert torch.equal(values, others)
 
 
 @pytest.fixture(scope="module")

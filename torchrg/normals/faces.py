@@ -257,6 +257,8 @@ def _join_faces(
         best = torch.full((count,), 2 * count)
         best.scatter_reduce_(0, owner[chosen], choices[chosen], "amin")
         rows = nonzero_rows(best < 2 * count)
+        if len(rows) == 0:
+            return indices, signs
         components = Components(count)
         components.link(rows.int(), (best[rows] // 2).int(), best[rows] % 2 == 1)
         joined, flips = components.find()

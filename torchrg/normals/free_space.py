@@ -6,11 +6,10 @@ from itertools import product
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrg import kernels
-from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_tasks
+from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_chunks, map_tasks
 from torchrg.linalg.moments import dot, kth_smallest
 from torchrg.neighbors.order import sort_integers
 from torchrg.normals.faces import gather_lists
@@ -34,6 +33,8 @@ _HALF_PATH = 8
 and a hall no more than a room."""
 _HALF_DIRECTIONS = [steps for steps in product((-1, 0, 1), repeat=3) if steps > (0, 0, 0)]
 """Thirteen of the 26 directions to neighboring cells, without their opposites."""
+_STRIDES = [math.sqrt(sum(map(abs, steps))) for steps in _HALF_DIRECTIONS]
+"""Their lengths, in cells."""
 
 
 def vote_free_side(
@@ -53,32 +54,32 @@ def vote_free_side(
     ``rows`` ``(n,)`` vote. Votes ``(n,)`` are positive if the normal points to the freer side.
     """
     at, cell = _mark_cells(points, rows, width)
-    normal = normals[rows]
-    obstacles = map_tasks(
-        lambda chunk: _find_obstacles(points, normals, near, chunk, width),
-        torch.split(rows, ROWS_IN_CACHE),
+    gaps = map_tasks(
+        lambda steps: torch.stack([gaps[cell] for gaps in _free_gaps(at, steps)]),
+        _HALF_DIRECTIONS,
         points.device,
     )
-    front, back = (torch.cat(side) for side in zip(*obstacles, strict=True))
+    free, high = torch.stack(gaps, dim=1), at.amax(dim=1, keepdim=True)
+    directions = normals.new_tensor(_HALF_DIRECTIONS)
+    strides = normals.new_tensor(_STRIDES)[:, None]
 
-    def vote(steps: tuple[int, ...]) -> Tensor:
-        stride = math.sqrt(sum(step * step for step in steps))
-        cosine = dot(normal, normal.new_tensor(steps)) / stride
-        ahead, behind = (
-            torch.from_numpy(score).to(normal) for score in _free_paths(at, cell, steps, stride)
-        )
+    def vote(chunk: slice) -> Tensor:
+        front, back = _find_obstacles(points, normals, near, rows[chunk], width)
+        here = at[:, cell[chunk]]
+        ends = high - here, here
+        to_ends = torch.stack([_shortest(directions, *sides) for sides in (ends, ends[::-1])])
+        ahead, behind = _weigh_paths(free[:, :, chunk], to_ends, strides).to(normals).unbind()
+        cosine = dot(normals[rows[chunk]], directions[:, None]) / strides
         is_front = cosine > 0
         ahead = torch.minimum(ahead, torch.where(is_front, front, back))
         behind = torch.minimum(behind, torch.where(is_front, back, front))
-        return cosine * cosine.abs() * (ahead - behind)
+        return reduce(torch.add, (cosine * cosine.abs() * (ahead - behind)).unbind())
 
-    return reduce(torch.add, map_tasks(vote, _HALF_DIRECTIONS, points.device))
+    return torch.cat(map_chunks(vote, len(rows), ROWS_IN_CACHE, points.device))
 
 
-def _mark_cells(
-    points: Tensor, rows: Tensor, width: float
-) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """Return the occupied cells ``(3, C)`` of a grid, and the index of the cell of some points."""
+def _mark_cells(points: Tensor, rows: Tensor, width: float) -> tuple[Tensor, Tensor]:
+    """Return the occupied cells ``(3, C)`` of a grid, int32, and the cell of some points."""
     low = torch.from_numpy(bounding_box(points.numpy())[0]).to(points)
 
     def encode(positions: Tensor) -> Tensor:
@@ -86,11 +87,10 @@ def _mark_cells(
         return (x * _MAX_CELLS + y) * _MAX_CELLS + z
 
     parts = [torch.unique_consecutive(encode(part)) for part in torch.split(points, ROWS_AT_ONCE)]
-    cells = sort_integers(torch.cat(parts))[1].numpy()
-    cells = cells[np.append(True, cells[1:] != cells[:-1])]
-    x_and_y, z_of_cell = np.divmod(cells, _MAX_CELLS)
-    at = np.stack([*np.divmod(x_and_y, _MAX_CELLS), z_of_cell]).astype(np.int32)
-    return at, np.searchsorted(cells, encode(points[rows]).numpy())
+    cells = torch.unique_consecutive(sort_integers(torch.cat(parts))[1])
+    x_and_y = cells // _MAX_CELLS
+    at = torch.stack([x_and_y // _MAX_CELLS, x_and_y % _MAX_CELLS, cells % _MAX_CELLS]).int()
+    return at, torch.searchsorted(cells, encode(points[rows]))
 
 
 def cell_width(points: Tensor, near: Tensor) -> float:
@@ -130,42 +130,43 @@ def _find_obstacles(
     return [1 / (1 + _HALF_PATH * width / path) for path in nearest]
 
 
-def _free_paths(
-    at: NDArray[np.int32], cell: NDArray[np.int64], steps: tuple[int, ...], stride: float
-) -> list[NDArray[np.float32]]:
-    """Return the weights of the free paths from some cells in a direction and its opposite.
+def _shortest(directions: Tensor, upper: Tensor, lower: Tensor) -> Tensor:
+    """Return the steps from cells to the bounding box in directions ``(13, 3)``, ``(13, n)``.
 
-    Of the occupied cells ``at`` ``(3, C)``, paths start at ``cell`` ``(n,)``. Each is ``(n,)``.
+    The box ends ``upper`` cells further along each axis, and ``lower`` cells before, ``(3, n)``.
     """
-    scores, here = [], at.take(cell, axis=1)
-    to_ends = at.max(axis=1, keepdims=True) - here, here
-    for gaps, sign in zip(_free_gaps(at, steps), (1, -1), strict=True):
-        free = gaps[cell]
-        ahead = [to_ends[step * sign < 0][axis] for axis, step in enumerate(steps) if step]
-        path = stride * np.where(free < 0, np.minimum.reduce(ahead), free).astype(np.float32)
-        weight = np.where(free < 0, np.float32(_OPEN_WEIGHT), np.float32(1))
-        scores.append(weight * (path / (path + np.float32(_HALF_PATH))))
-    return scores
+    steps = directions[:, :, None]
+    return torch.where(steps > 0, upper, lower).masked_fill(steps == 0, _MAX_CELLS).amin(dim=1)
 
 
-def _free_gaps(at: NDArray[np.int32], steps: tuple[int, ...]) -> tuple[NDArray[np.int32], ...]:
+def _weigh_paths(free: Tensor, to_ends: Tensor, strides: Tensor) -> Tensor:
+    """Return the weights of paths from the lengths of steps, float32.
+
+    Paths have ``free`` cells up to an obstacle, or -1, and ``to_ends`` to the bounding box.
+    """
+    is_open = free < 0
+    path = strides.float() * torch.where(is_open, to_ends, free)
+    weight = path / (path + _HALF_PATH)
+    return torch.where(is_open, _OPEN_WEIGHT * weight, weight)
+
+
+def _free_gaps(at: Tensor, steps: tuple[int, ...]) -> tuple[Tensor, ...]:
     """Return the number of free cells ahead of cells ``(3, C)`` and behind, -1 without an end.
 
     Gaps between the cells of a line are paths, without a grid of empty cells.
     """
     if kernels.serve():
         size = 2 ** (2 * at.shape[1] + 8).bit_length()
-        table = [torch.from_numpy(np.empty(size, kind)) for kind in (np.int64, np.int32)]
-        found = kernels.call("free_gaps", torch.from_numpy(at), *steps, *table)
-        return tuple(gaps.numpy() for gaps in found)
+        table = torch.empty(size, dtype=torch.int64), torch.empty(size, dtype=torch.int32)
+        return kernels.call("free_gaps", at, *steps, *table)
     a = next(axis for axis in range(3) if steps[axis])
     b, c = (axis for axis in range(3) if axis != a)
     first, second = (at[axis] - steps[axis] * at[a] for axis in (b, c))
     # Cells are ascending, and the sort is stable: the cells of a line remain ascending.
-    order = np.lexsort((second, first))
+    order = torch.from_numpy(np.lexsort((second.numpy(), first.numpy())))
     first, second, along = first[order], second[order], at[a][order]
     is_same = (first[1:] == first[:-1]) & (second[1:] == second[:-1])
-    gaps = np.where(is_same, along[1:] - along[:-1] - 1, -1)
-    ahead, behind = np.empty((2, len(order)), np.int32)
-    ahead[order], behind[order] = np.append(gaps, -1), np.insert(gaps, 0, -1)
+    gaps, none = torch.where(is_same, along.diff() - 1, -1), along.new_tensor([-1])
+    ahead, behind = torch.empty_like(along), torch.empty_like(along)
+    ahead[order], behind[order] = torch.cat([gaps, none]), torch.cat([none, gaps])
     return ahead, behind
