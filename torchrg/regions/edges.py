@@ -43,6 +43,7 @@ class GrowingInput(NamedTuple):
         max_color_distance: Maximum color difference between neighbors of a region.
         signed_normals: Whether opposite normals differ by 180 degrees instead of 0.
         angle_fraction: Fraction of ``max_angle_deg`` that limits the angle between normals.
+        radii: Distance of each point to its last neighbor, shape ``(N,)``, or None if unknown.
     """
 
     points: Tensor
@@ -55,6 +56,7 @@ class GrowingInput(NamedTuple):
     max_color_distance: float = math.inf
     signed_normals: bool = False
     angle_fraction: float = 1.0
+    radii: Tensor | None = None
 
     def select(self, rows: Tensor, neighbors: Neighbors) -> "GrowingInput":
         """Return the points ``rows`` ``(n,)`` as a cloud with the given neighbors."""
@@ -66,6 +68,7 @@ class GrowingInput(NamedTuple):
             valid=self.valid[rows],
             reach=None if self.reach is None else self.reach[rows],
             colors=None if self.colors is None else to_column_major(self.colors[rows]),
+            radii=None,
         )
 
 
@@ -259,21 +262,19 @@ def coplanarity_limits(residuals: Tensor, floor: Tensor, mask: Tensor | None = N
     return median(residuals, mask=mask) + 2 * scale
 
 
-def neighborhood_radii(points: Tensor, neighbors: Neighbors, rows: Tensor | None = None) -> Tensor:
-    """Return the distance of points ``rows`` ``(n,)``, default all, to their last neighbor."""
+def neighborhood_radii(points: Tensor, neighbors: Neighbors) -> Tensor:
+    """Return the distance of each point to its last neighbor, shape ``(N,)``."""
     indices, counted = neighbors
 
-    def measure(chunk: slice) -> Tensor:
-        selected = chunk if rows is None else rows[chunk]
-        last = indices[selected, -1]
+    def measure(rows: slice) -> Tensor:
+        last = indices[rows, -1]
         if counted is not None:
-            column = counted[selected].sum(dim=1, keepdim=True).sub_(1).clamp_(min=0)
-            last = indices[selected].gather(1, column).squeeze(1)
-        x, y, z = (column.index_select(0, last) - column[selected] for column in points.T)
+            column = counted[rows].sum(dim=1, keepdim=True).sub_(1).clamp_(min=0)
+            last = indices[rows].gather(1, column).squeeze(1)
+        x, y, z = (column.index_select(0, last) - column[rows] for column in points.T)
         return rounded_sqrt(sq_lengths((x, y, z)))
 
-    num_rows = len(points if rows is None else rows)
-    return torch.cat(map_chunks(measure, num_rows, ROWS_AT_ONCE, points.device))
+    return torch.cat(map_chunks(measure, len(points), ROWS_AT_ONCE, points.device))
 
 
 def patch_radii(columns: Columns, mask: Tensor | None = None) -> Tensor:

@@ -105,8 +105,8 @@ class RegionPlanes(NamedTuple):
         It is 0 for unlabeled points, whose regions are -1.
         """
         rows, total = (regions + 1).reshape(-1), torch.zeros_like(regions, dtype=self.center.dtype)
-        tables = (pad(vectors.T, (1, 0)) for vectors in (self.center, self.normal))
-        for column, *plane in zip(points.unbind(dim=1), *tables, strict=True):
+        table = pad(torch.stack([self.center.T, self.normal.T]), (1, 0))
+        for column, *plane in zip(points.unbind(dim=1), *table.unbind(), strict=True):
             # By columns in a fourth of the time of vectors.
             start, slope = (values.index_select(0, rows).view(regions.shape) for values in plane)
             total += (column - start).mul_(slope)
@@ -135,6 +135,8 @@ def fit_planes(
         list(zip(chunks, chunk_normals, strict=True)),
         points.device,
     )
+    if len(parts) == 1:
+        return parts[0]
     return RegionPlanes(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 
@@ -194,8 +196,10 @@ def fit_regions(cloud: GrowingInput, labels: Tensor, config: GrowingConfig) -> R
     """
     segments = Segments(labels, max_points=MAX_FITTED)
     planes = fit_planes(segments, cloud.points, cloud.normals)
-    radii = neighborhood_radii(cloud.points, cloud.neighbors, segments.rows)
-    radius = segments.median(radii).double()
+    radii = cloud.radii
+    if radii is None:
+        radii = neighborhood_radii(cloud.points, cloud.neighbors)
+    radius = segments.median(segments.gather(radii)).double()
     floor = config.coplanarity_floor * radius
     facets = _FACET_THICKNESS * float(config.facet_tolerance or 0.0)
     planes = planes._replace(

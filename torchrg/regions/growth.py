@@ -23,7 +23,7 @@ from torchrg.neighbors.order import ascending_rows
 from torchrg.regions.adjacency import KnnAdjacency
 from torchrg.regions.edges import GrowingInput, has_late_promotion, mark_edges, neighborhood_radii
 from torchrg.regions.fit import MIN_FITTED, RegionFits, find_solid_regions
-from torchrg.regions.repair import keep_regions, merge_facets, refine_regions
+from torchrg.regions.repair import keep_regions, merge_facets, refine_regions, remove_small
 from torchrg.regions.splits import cut_bridges, split_levels
 from torchrg.structures import UNLABELED, AnyCloud, Neighbors
 from torchrg.structures.points import Colors, Points, Values
@@ -160,7 +160,9 @@ def label_regions(
     if config.facet_tolerance is not None:
         contacts = KnnAdjacency(cloud.neighbors).contacts(labels)
         merged = merge_facets(labels, contacts, fits.get(labels), config)
-        labels = rank_by_size(merged, min_points)
+        # Unchanged labels are ranked already.
+        rank = remove_small if merged is labels else rank_by_size
+        labels = rank(merged, min_points)
     if config.cut_bridges:
         split = split_levels(cloud, labels, fits.get(labels), config)
         labels = labels if split is labels else rank_by_size(split, 1)
@@ -198,7 +200,7 @@ def checked_cloud(
         raise ShapeError(f"{caller}: expected valid of bool, got {valid.dtype}.")
     # Normals of another source may have more digits, which decide at the limits.
     is_estimated = is_single(normals) and is_single(curvature)
-    positions, reach = to_single(points) if is_estimated else points, None
+    positions, reach, radii = to_single(points) if is_estimated else points, None, None
     normals, curvature = normals.to(positions), curvature.to(positions)
     if config.plane_reach is not None:
         if residual_rms is None:
@@ -211,13 +213,15 @@ def checked_cloud(
         check_floating(caller, residual_rms=residual_rms)
         # The noise is unknown if the fit is exact.
         residual_rms = residual_rms.to(positions)
-        floor = config.coplanarity_floor * neighborhood_radii(positions, neighbors)
+        radii = scratch.store(neighborhood_radii(positions, neighbors))
+        floor = config.coplanarity_floor * radii
         reach = torch.where(residual_rms > floor, config.plane_reach * residual_rms, torch.inf)
     positions, normals = to_column_major(positions), to_column_major(normals)
     valid = curvature.isfinite() if valid is None else curvature.isfinite() & valid
     for column in normals.unbind(dim=1):
         valid &= column.isfinite()
-    return GrowingInput(positions, normals, curvature, neighbors, valid, reach)
+    columns = positions, normals, curvature, neighbors, valid, reach
+    return GrowingInput(*columns, radii=radii)
 
 
 def _add_colors(cloud: GrowingInput, colors: Colors | None, max_distance: float) -> GrowingInput:
@@ -241,8 +245,11 @@ def rank_by_size(regions: Tensor, min_size: int) -> Tensor:
     """
     old = regions.cpu().numpy()
     # Count runs of equal labels at once: many are long.
-    starts = np.append(0, np.flatnonzero(old[1:] != old[:-1]) + 1)[: len(old)]
-    lengths, run_labels = np.diff(starts, append=len(old)), old[starts]
+    is_end = np.ones(len(old) + 1, dtype=bool)
+    np.not_equal(old[1:], old[:-1], out=is_end[1:-1])
+    ends = np.flatnonzero(is_end)
+    starts, lengths = ends[:-1], ends[1:] - ends[:-1]
+    run_labels = old[starts]
     num = int(run_labels.max(initial=UNLABELED)) + 1
     sizes = np.bincount(run_labels + 1, lengths, minlength=num + 1)[1:]
     large = np.flatnonzero(sizes >= max(min_size, 1))

@@ -33,9 +33,9 @@ def candidate_ranks(num_neighbors: int) -> Tensor:
     # The plastic number's low-discrepancy sequence covers the square of pairs evenly.
     steps = np.arange(1, 8 * num_pairs)[:, None] * np.array([0.7548776662466927, 0.569840290998])
     ranks = 1 + np.floor(last * (steps % 1.0) ** constants.CANDIDATE_POWER).astype(int)
-    pairs = dict.fromkeys((min(a, b), max(a, b)) for a, b in ranks.tolist() if a != b)
-    found = list(pairs)[:num_pairs] if last > 1 else []
-    return torch.tensor(found, dtype=torch.int64, device="cpu").view(-1, 2)
+    pairs = np.sort(ranks[ranks[:, 0] != ranks[:, 1]], axis=1)
+    first = np.unique(pairs @ [num_neighbors, 1], return_index=True)[1]
+    return torch.from_numpy(pairs[np.sort(first)[:num_pairs]])
 
 
 def vote_planes(

@@ -75,8 +75,8 @@ def fit_surfaces(
     )
 
     def split(rows: Tensor) -> None:
-        scale = noise[rows]
-        voted, planes = broken_planes(points, neighbors.select(rows), scale, fit.normals[rows])
+        near, scale = neighbors.select(rows), noise[rows]
+        voted, planes = broken_planes(points, near, scale, fit.normals[rows])
         by_votes.normals[rows], by_votes.offsets[rows] = voted
         meeting.normals[rows], meeting.offsets[rows] = planes.normals, planes.offsets
         explained[rows] = planes.deviations <= constants.MEETING_LIMIT * scale
@@ -84,16 +84,17 @@ def fit_surfaces(
         residual = torch.where(has_planes, planes.deviations, scale)
         unit = torch.maximum(scale, residual)
         drop = (deviations[rows] / unit).square() - (residual / unit).square()
-        drop *= counts[rows] - _PARABOLOID_PARAMETERS
+        drop *= _count_each(near) - _PARABOLOID_PARAMETERS
         upper = constants.MAX_GAIN
         gain[rows] = torch.where(has_planes, drop, -upper).clamp_(-upper, upper)
 
     candidates = broken & (_may_meet(broken, neighbors, chunk_size) | far_off)
-    counts = torch.full_like(neighbors.indices[:, 0], neighbors.indices.shape[1])
+    groups = [candidates] if bool(candidates.any()) else []
     if neighbors.valid is not None:
         counts = neighbors.valid.sum(dim=1)
-    for count in torch.unique(counts[candidates]).tolist():
-        map_selected(split, candidates & (counts == count), chunk_size)
+        groups = [candidates & (counts == count) for count in torch.unique(counts[candidates])]
+    for group in groups:
+        map_selected(split, group, chunk_size)
     pooled = _mean_of_nearest(gain, neighbors, chunk_size)
     meets = broken & explained & (gain > constants.MIN_GAIN) & (pooled > constants.MIN_POOLED_GAIN)
     voted = broken & ~meets & far_off
@@ -113,7 +114,6 @@ def broken_planes(
     :func:`torchrg.normals.consensus.hypotheses.fit_meeting_planes`.
     """
     if kernels.serve(points, *near, noise, normals, k=near.indices.shape[1]) and len(noise):
-        count = near.indices.shape[1] if near.valid is None else int(near.valid[0].sum())
         parameters = (
             constants.VOTE_REACH,
             constants.VOTE_FALLOFF,
@@ -126,7 +126,7 @@ def broken_planes(
             constants.NUM_ALTERNATIONS,
             constants.MIN_PLANE_POINTS,
         )
-        tables = candidate_ranks(count), torch.tensor(parameters, dtype=torch.float32)
+        tables = candidate_ranks(_count_each(near)), torch.tensor(parameters, dtype=torch.float32)
         fits = kernels.call("broken_planes", points, *near, noise, normals, *tables)
         return TangentPlanes(*fits[:2]), MeetingPlanes(*fits[2:])
     columns = _gather_counted(points, near)
@@ -134,13 +134,17 @@ def broken_planes(
     return TangentPlanes(*voted), fit_meeting_planes(columns, *voted, noise)
 
 
+def _count_each(near: Neighbors) -> int:
+    """Return the number of neighbors of each of some points with equal neighbor counts."""
+    return near.indices.shape[1] if near.valid is None else int(near.valid[0].sum())
+
+
 def _gather_counted(points: Tensor, near: Neighbors) -> Columns:
     """Return columns of the counted neighbors, of points with equal neighbor counts."""
     patches = gather_patches(points, near.indices)
     if near.valid is not None:
-        counted = near.valid
-        order = (~counted).to(torch.uint8).argsort(dim=1, stable=True)
-        order = order[:, : int(counted[0].sum())]
+        order = (~near.valid).to(torch.uint8).argsort(dim=1, stable=True)
+        order = order[:, : _count_each(near)]
         patches = patches.gather(1, order[:, :, None].expand(-1, -1, 3))
     return unbind_columns(patches)
 
