@@ -6,7 +6,6 @@ import torch
 
 from torchrg.linalg.moments import Segments
 from torchrg.neighbors import canonical_order, search_knn
-from torchrg.regions.adjacency import KnnAdjacency
 from torchrg.regions.edges import GrowingInput
 from torchrg.regions.fit import fit_planes
 from torchrg.regions.repair import refine_borders
@@ -46,9 +45,7 @@ def refined(points, labels, normals, valid=None, reach=9e-3, thickness=(NOISE, N
     planes = fit_planes(Segments(torch.arange(count)), torch.zeros(count, 3).double(), normals)
     planes = planes._replace(thickness=torch.tensor(thickness).double())
     reach = torch.full((count,), reach).double()
-    found = refine_borders(
-        cloud, KnnAdjacency(cloud.neighbors), torch.as_tensor(labels)[order], planes, reach
-    )
+    found = refine_borders(cloud, torch.as_tensor(labels)[order], planes, reach)
     return torch.empty_like(found).index_copy_(0, order, found)
 
 

@@ -100,9 +100,7 @@ def test_points_between_parallel_regions_go_to_the_nearer_plane(step):
     # A rim of the board, 4 cm wide, has the label of the wall.
     x, y = cloud.points[:, 0] - 1, cloud.points[:, 1] - 0.5
     wrong[(truth == 1) & ((x.abs() > 0.26) | (y.abs() > 0.21))] = 0
-    found = assign_levels(
-        cloud, KnnAdjacency(cloud.neighbors), wrong, fit_regions(cloud, wrong, CONFIG)
-    )
+    found = assign_levels(cloud, wrong, fit_regions(cloud, wrong, CONFIG))
     assert (wrong != truth).sum() > 200
     assert (found != truth).sum() < 10
 
@@ -111,12 +109,7 @@ def test_pieces_of_one_face_keep_their_points():
     points, _ = wall_with_board(np.random.default_rng(7), 0.0)
     cloud, _ = flat_cloud(points)
     labels = (cloud.points[:, 0] > 1).long()
-    assert torch.equal(
-        assign_levels(
-            cloud, KnnAdjacency(cloud.neighbors), labels, fit_regions(cloud, labels, CONFIG)
-        ),
-        labels,
-    )
+    assert torch.equal(assign_levels(cloud, labels, fit_regions(cloud, labels, CONFIG)), labels)
 
 
 def test_thick_regions_across_a_step_do_not_join_its_sides():

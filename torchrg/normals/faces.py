@@ -6,7 +6,6 @@ contains one copy of each of its nodes and is a face.
 """
 
 import math
-from threading import Lock
 
 import torch
 from torch import Tensor
@@ -14,7 +13,7 @@ from torch import Tensor
 from torchrg import kernels, scratch
 from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_tasks, nonzero_rows, split_rows
 from torchrg.linalg.moments import dot
-from torchrg.neighbors.components import Components
+from torchrg.neighbors.components import connected_components
 from torchrg.neighbors.order import mark_distinct, sort_integers
 
 _RANKS = (2, 4, 6, 9, 12, 15)
@@ -181,17 +180,13 @@ def _grow_patches(
     limit = min(max(_BEND_FACTOR * typical, _MIN_BEND), _MAX_BEND)
     node = torch.full((len(points),), -1, dtype=torch.int32)
     node[rows] = torch.arange(len(rows), dtype=torch.int32)
-    patches, lock = Components(len(rows)), Lock()
 
-    def link(chunk: Tensor) -> None:
+    def link(chunk: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         starts, ends, cosine, _ = _find_links(points, normals, near, chunk, ranks, node, limit)
-        nodes = node.index_select(0, starts), node.index_select(0, ends)
-        # The components do not depend on the order of the links.
-        with lock:
-            patches.link(*nodes, cosine < 0)
+        return node.index_select(0, starts), node.index_select(0, ends), cosine < 0
 
-    map_tasks(link, torch.split(rows, ROWS_AT_ONCE), rows.device)
-    return patches.find()
+    links = map_tasks(link, torch.split(rows, ROWS_AT_ONCE), rows.device)
+    return connected_components(len(rows), *map(torch.cat, zip(*links, strict=True)))
 
 
 def _find_links(
@@ -259,9 +254,8 @@ def _join_faces(
         rows = nonzero_rows(best < 2 * count)
         if len(rows) == 0:
             return indices, signs
-        components = Components(count)
-        components.link(rows.int(), (best[rows] // 2).int(), best[rows] % 2 == 1)
-        joined, flips = components.find()
+        best = best[rows]
+        joined, flips = connected_components(count, rows, best // 2, best % 2 == 1)
         count = int(joined.max()) + 1
         if count == len(sizes):
             return indices, signs

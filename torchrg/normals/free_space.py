@@ -54,21 +54,19 @@ def vote_free_side(
     ``rows`` ``(n,)`` vote. Votes ``(n,)`` are positive if the normal points to the freer side.
     """
     at, cell = _mark_cells(points, rows, width)
-    gaps = map_tasks(
-        lambda steps: torch.stack([gaps[cell] for gaps in _free_gaps(at, steps)]),
-        _HALF_DIRECTIONS,
-        points.device,
-    )
-    free, high = torch.stack(gaps, dim=1), at.amax(dim=1, keepdim=True)
+
+    def find_free(steps: tuple[int, ...]) -> Tensor:
+        return torch.stack([gaps[cell] for gaps in _free_gaps(at, steps)])
+
+    free = torch.stack(map_tasks(find_free, _HALF_DIRECTIONS, points.device), dim=1)
+    high = at.amax(dim=1, keepdim=True)
     directions = normals.new_tensor(_HALF_DIRECTIONS)
     strides = normals.new_tensor(_STRIDES)[:, None]
 
     def vote(chunk: slice) -> Tensor:
         front, back = _find_obstacles(points, normals, near, rows[chunk], width)
         here = at[:, cell[chunk]]
-        ends = high - here, here
-        to_ends = torch.stack([_shortest(directions, *sides) for sides in (ends, ends[::-1])])
-        ahead, behind = _weigh_paths(free[:, :, chunk], to_ends, strides).to(normals).unbind()
+        ahead, behind = _weigh_paths(free[:, :, chunk], here, high - here).to(normals).unbind()
         cosine = dot(normals[rows[chunk]], directions[:, None]) / strides
         is_front = cosine > 0
         ahead = torch.minimum(ahead, torch.where(is_front, front, back))
@@ -130,22 +128,17 @@ def _find_obstacles(
     return [1 / (1 + _HALF_PATH * width / path) for path in nearest]
 
 
-def _shortest(directions: Tensor, upper: Tensor, lower: Tensor) -> Tensor:
-    """Return the steps from cells to the bounding box in directions ``(13, 3)``, ``(13, n)``.
+def _weigh_paths(free: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
+    """Return the weights of paths in each direction and its opposite, ``(2, 13, n)``, float32.
 
-    The box ends ``upper`` cells further along each axis, and ``lower`` cells before, ``(3, n)``.
+    Paths have ``free`` cells up to an obstacle, or -1. The bounding box ends ``lower`` cells before
+    their start along each axis, and ``upper`` cells after it, ``(3, n)``.
     """
-    steps = directions[:, :, None]
-    return torch.where(steps > 0, upper, lower).masked_fill(steps == 0, _MAX_CELLS).amin(dim=1)
-
-
-def _weigh_paths(free: Tensor, to_ends: Tensor, strides: Tensor) -> Tensor:
-    """Return the weights of paths from the lengths of steps, float32.
-
-    Paths have ``free`` cells up to an obstacle, or -1, and ``to_ends`` to the bounding box.
-    """
-    is_open = free < 0
-    path = strides.float() * torch.where(is_open, to_ends, free)
+    steps, is_open = torch.tensor(_HALF_DIRECTIONS)[:, :, None], free < 0
+    ends = (torch.where(steps > 0, *sides) for sides in ((upper, lower), (lower, upper)))
+    to_ends = torch.stack([end.masked_fill(steps == 0, _MAX_CELLS).amin(dim=1) for end in ends])
+    strides = torch.tensor(_STRIDES, dtype=torch.float32)[:, None]
+    path = strides * torch.where(is_open, to_ends, free)
     weight = path / (path + _HALF_PATH)
     return torch.where(is_open, _OPEN_WEIGHT * weight, weight)
 

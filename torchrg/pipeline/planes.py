@@ -223,7 +223,7 @@ def _segment(
     )
     sharp = torch.zeros_like(fit.valid) if fit.sharp is None else fit.sharp
     found_normals, found_curvature, found_sharp, found_valid = (
-        scratch.store(expand_to_points(values, sites.inverse))
+        scratch.store(sites.restore(values))
         for values in (fit.normals, fit.curvature, sharp, fit.valid)
     )
     planes = site_planes
@@ -241,7 +241,7 @@ def _segment(
     def turn(orient: Orientation) -> Tensor:
         axes = site_planes.normal
         turned = turn_faces(sites.points, fit.normals, orient, neighbors, site_labels, axes)
-        return scratch.store(expand_to_points(turned, sites.inverse))
+        return scratch.store(sites.restore(turned))
 
     normals = choose_side(points, found_normals, *side, turn)
     begin("done")
@@ -259,22 +259,13 @@ def _segment(
     )
 
 
-class _Sites(NamedTuple):
-    """Distinct points, or one point per voxel, in canonical order.
+def _find_sites(distinct: DistinctPoints, voxel: float | None) -> DistinctPoints:
+    """Return distinct points, or one point per voxel, in canonical order.
 
-    Attributes:
-        points: Shape ``(S, 3)``.
-        inverse: Site of each point of the cloud, shape ``(N,)``, or -1.
+    Warn if the voxel size is probably in another unit.
     """
-
-    points: Tensor
-    inverse: Tensor
-
-
-def _find_sites(distinct: DistinctPoints, voxel: float | None) -> _Sites:
-    """Return the sites of a cloud; warn if the voxel size is probably in another unit."""
     if voxel is None:
-        return _Sites(distinct.points, distinct.inverse)
+        return distinct
     voxels = sample_voxels(distinct.points, voxel)
     order = canonical_order(distinct.points[voxels.rows])
     site, inverse = order.argsort(), scratch.new_empty(distinct.inverse, distinct.inverse.shape)
@@ -282,7 +273,8 @@ def _find_sites(distinct: DistinctPoints, voxel: float | None) -> _Sites:
         known = expand_to_points(voxels.inverse, distinct.inverse[rows], fill=UNLABELED)
         inverse[rows] = expand_to_points(site, known, fill=UNLABELED)
     warn_about_voxel("segment_planes", voxel, len(order), len(distinct.points))
-    return _Sites(scratch.store(distinct.points[voxels.rows[order]]), inverse)
+    chosen = voxels.rows[order]
+    return DistinctPoints(scratch.store(distinct.points[chosen]), distinct.rows[chosen], inverse)
 
 
 class _Parts(NamedTuple):
@@ -309,7 +301,7 @@ class _Parts(NamedTuple):
 
 
 def _split_by_object(
-    sites: _Sites, neighbors: Neighbors, objects: Tensor | None, chunk_size: int
+    sites: DistinctPoints, neighbors: Neighbors, objects: Tensor | None, chunk_size: int
 ) -> _Parts:
     """Return the parts of the sites."""
     if objects is None:

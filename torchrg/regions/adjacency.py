@@ -113,17 +113,12 @@ def find_adjacency(
 
 
 class KnnAdjacency:
-    """Adjacency of a point cloud: up to 8 nearest neighbors per point.
-
-    The boundary and the contacts of the last labels are kept.
-    """
+    """Adjacency of a point cloud: up to 8 nearest neighbors per point."""
 
     def __init__(self, neighbors: Neighbors) -> None:
         valid = None if neighbors.valid is None else neighbors.valid[:, _NEAREST]
         self._all, self.neighbors = neighbors, Neighbors(neighbors.indices[:, _NEAREST], valid)
         self._points = neighbors.indices[:, :1]
-        self._boundary: tuple[Tensor, Tensor] | None = None
-        self._contacts: tuple[Tensor, tuple[Tensor, Tensor]] | None = None
 
     def neighbor_rows(self, rows: Rows) -> Tensor:
         """Return the neighbors of the given points, shape ``(n, 8)``, padded with the point."""
@@ -132,29 +127,32 @@ class KnnAdjacency:
 
     def contacts(self, labels: Tensor) -> tuple[Tensor, Tensor]:
         """Apply :func:`find_region_pairs` to the nearest neighbors."""
-        if self._contacts is None or self._contacts[0] is not labels:
-            rows = self.boundary(labels)
-            labeled = rows[labels[rows] >= 0].to(torch.int32)
-            edges = _RegionEdges(labels, self._all, _NEAREST, labeled)
-            self._contacts = labels, (edges.pairs, edges.counts)
-        return self._contacts[1]
+        return find_region_pairs(labels, self._all, _NEAREST)
 
     def boundary(self, labels: Tensor) -> Tensor:
         """Return the points with a nearest neighbor in another region, also unlabeled points."""
-        if self._boundary is None or self._boundary[0] is not labels:
-            rows = torch.arange(len(labels), dtype=torch.int32, device=labels.device)
-            found = _boundary_rows(rows, labels.to(torch.int32), self._all, _NEAREST)
-            self._boundary = labels, found.long()
-        return self._boundary[1]
+        low, high, _ = _NEAREST.indices(self._all.indices.shape[1])
+        narrow = labels.to(torch.int32)
+
+        def mark(rows: slice) -> Tensor:
+            part = torch.arange(rows.start, rows.stop, dtype=torch.int32, device=labels.device)
+            if kernels.serve(narrow, *self._all):
+                return kernels.call("mark_boundary", narrow, *self._all, part, low, high)[0]
+            return _crosses(narrow, part, self._all.select(part), _NEAREST).any(dim=1)
+
+        at_once = limit_rows(ROWS_AT_ONCE, self._all.indices.shape[1])
+        return nonzero_rows(torch.cat(map_chunks(mark, len(labels), at_once, labels.device)))
 
 
-def find_region_pairs(labels: Tensor, neighbors: Neighbors) -> tuple[Tensor, Tensor]:
+def find_region_pairs(
+    labels: Tensor, neighbors: Neighbors, columns: slice = slice(None)
+) -> tuple[Tensor, Tensor]:
     """Return pairs of adjacent regions and the number of edges between them.
 
-    For labels ``(N,)``, negative if unlabeled: pairs ``(E, 2)``, smaller label first, ascending,
-    and counts ``(E,)``.
+    For labels ``(N,)``, negative if unlabeled, and some columns of the lists: pairs ``(E, 2)``,
+    smaller label first, ascending, and counts ``(E,)``.
     """
-    edges = _RegionEdges(labels, neighbors)
+    edges = _RegionEdges(labels, neighbors, columns)
     return edges.pairs, edges.counts
 
 
@@ -170,30 +168,21 @@ class _Contacts(NamedTuple):
 class _RegionEdges:
     """Edges between regions, found again on each pass: storing all could take more than the cloud.
 
-    Those of a single chunk of points are kept.
-
-    ``pairs`` ``(E, 2)`` are the adjacent regions, ascending, and ``counts`` ``(E,)`` their edges.
-    Edges start at the points ``rows`` ``(n,)``, int32, by default all, and lead to some columns.
+    Those of a single chunk of points are kept. ``pairs`` ``(E, 2)`` are the adjacent regions,
+    ascending, and ``counts`` ``(E,)`` their edges.
     """
 
-    def __init__(
-        self,
-        labels: Tensor,
-        neighbors: Neighbors,
-        columns: slice = slice(None),
-        rows: Tensor | None = None,
-    ) -> None:
+    def __init__(self, labels: Tensor, neighbors: Neighbors, columns: slice = slice(None)) -> None:
         # int32 indexing is three times faster.
         self._labels, self._neighbors, self._columns = labels.to(torch.int32), neighbors, columns
         self._num_regions = max(int(labels.max()) + 1, 1) if len(labels) else 1
         at_once = limit_rows(ROWS_IN_CACHE, neighbors.indices.shape[1])
-        if rows is None:
-            labeled = nonzero_rows(self._labels >= 0).to(torch.int32)
-            rows = _boundary_rows(labeled, self._labels, neighbors, columns)
+        rows = nonzero_rows(self._labels >= 0).to(torch.int32)
         self._chunks = torch.split(rows, at_once)
         self._kept = self._find(rows) if len(self._chunks) == 1 else None
-        chunk_keys = [self._find(chunk)[3].clone() for chunk in self._chunks if not self._kept]
-        keys = self._kept[3] if self._kept else torch.cat(chunk_keys)
+        found = self._map(lambda edges: (torch.unique_consecutive(edges[0]), edges[3].clone()))
+        rows, keys = (torch.cat(parts) for parts in zip(*found, strict=True))
+        self._chunks = torch.split(rows, at_once)
         if self._num_regions**2 <= len(labels):
             # A table of all pairs is faster than a sort.
             table = torch.bincount(keys)
@@ -222,30 +211,18 @@ class _RegionEdges:
         keys = ends.amin(dim=0).long() * self._num_regions + ends.amax(dim=0)
         return [source, targets, chosen % width, keys]
 
-    def map_contacts(self, work: Callable[[_Contacts], Returned]) -> Iterator[Returned]:
+    def _map(self, work: Callable[[list[Tensor]], Returned]) -> Iterator[Returned]:
         """Yield the results of ``work`` for all edges in order, one chunk of points at a time."""
 
         def find(rows: Tensor) -> Returned:
-            *edges, keys = self._kept or self._find(rows)
-            return work(_Contacts(self._index(keys), *edges))
+            return work(self._kept or self._find(rows))
 
         for batch in split_rows(len(self._chunks), _CHUNKS_AT_ONCE):
             yield from map_tasks(find, self._chunks[batch], self._labels.device)
 
-
-def _boundary_rows(rows: Tensor, labels: Tensor, neighbors: Neighbors, columns: slice) -> Tensor:
-    """Return which of the rows have a neighbor in another region; all of them are int32."""
-    low, high, _ = columns.indices(neighbors.indices.shape[1])
-
-    def mark(chunk: slice) -> Tensor:
-        part = rows[chunk]
-        if kernels.serve(labels, *neighbors):
-            return kernels.call("mark_boundary", labels, *neighbors, part, low, high)[0]
-        return _crosses(labels, part, neighbors.select(part), columns).any(dim=1)
-
-    at_once = limit_rows(ROWS_AT_ONCE, neighbors.indices.shape[1])
-    meets = torch.cat(map_chunks(mark, len(rows), at_once, labels.device))
-    return rows.index_select(0, nonzero_rows(meets))
+    def map_contacts(self, work: Callable[[_Contacts], Returned]) -> Iterator[Returned]:
+        """Yield the results of ``work`` for the edges of each chunk of points, in order."""
+        return self._map(lambda edges: work(_Contacts(self._index(edges[3]), *edges[:3])))
 
 
 def _crosses(labels: Tensor, rows: Rows, near: Neighbors, columns: slice) -> Tensor:

@@ -92,8 +92,8 @@ def refine_regions(
         # The plane of a bent region does not show where the region ends.
         vague = planes.bent | (planes.num_points < MIN_FITTED)
         reach = torch.where(vague, torch.nan, planes.scale_thickness(config.absorb_reach))
-        labels = refine_borders(cloud, adjacency, labels, planes, reach)
-        labels = assign_levels(cloud, adjacency, labels, planes)
+        labels = refine_borders(cloud, labels, planes, reach)
+        labels = assign_levels(cloud, labels, planes)
         if config.facet_tolerance is not None:
             # A gap narrower than a neighborhood may divide a faceted surface. With white noise,
             # growth crosses it on one plane: regions still apart, such as cushions side by side,
@@ -374,11 +374,7 @@ def _misfit(
 
 
 def refine_borders(
-    cloud: GrowingInput,
-    adjacency: KnnAdjacency,
-    labels: Tensor,
-    planes: RegionPlanes,
-    reach: Tensor,
+    cloud: GrowingInput, labels: Tensor, planes: RegionPlanes, reach: Tensor
 ) -> Tensor:
     """Reassign boundary points to the region that explains them best.
 
@@ -392,16 +388,14 @@ def refine_borders(
     to a nearer plane.
 
     ``reach`` ``(M,)`` is the maximum point-to-plane distance, NaN for regions that are not flat,
-    which are left unchanged. If no point moves, ``labels`` itself is returned.
+    which are left unchanged.
     """
     flat = torch.cat([reach.isfinite(), reach.new_ones(1, dtype=torch.bool)])
-    choose = partial(_choose_regions, cloud, planes, reach)
-    return _reassign(cloud, adjacency, labels, planes, flat, choose)
+    return _reassign(cloud, labels, planes, flat, partial(_choose_regions, cloud, planes, reach))
 
 
 def _reassign(
     cloud: GrowingInput,
-    adjacency: KnnAdjacency,
     labels: Tensor,
     planes: RegionPlanes,
     movable: Tensor,
@@ -414,10 +408,11 @@ def _reassign(
     Only valid points of ``movable`` regions are passed, ``(M + 1,)``, the last entry for unlabeled
     points.
     """
-    unchanged, rows = labels, adjacency.boundary(labels)
+    adjacency = KnnAdjacency(cloud.neighbors)
     # int32 is faster to index and to compare.
     labels = labels.to(torch.int32, copy=True)
-    for number in range(_MAX_PASSES):
+    rows = adjacency.boundary(labels)
+    for _ in range(_MAX_PASSES):
         rows = rows[movable[labels[rows]] & cloud.valid[rows]]
         near = adjacency.neighbor_rows(rows)
 
@@ -430,16 +425,14 @@ def _reassign(
         chosen = torch.cat(map_chunks(work, len(rows), ROWS_IN_CACHE, labels.device))
         moved = chosen != labels[rows]
         if not bool(moved.any()):
-            return labels.long() if number else unchanged
+            break
         rows = rows[moved]
         labels[rows] = chosen[moved]
         rows = torch.unique(torch.cat([rows, near[moved].flatten()]))
     return labels.long()
 
 
-def assign_levels(
-    cloud: GrowingInput, adjacency: KnnAdjacency, labels: Tensor, planes: RegionPlanes
-) -> Tensor:
+def assign_levels(cloud: GrowingInput, labels: Tensor, planes: RegionPlanes) -> Tensor:
     """Reassign boundary points of parallel regions to the nearer plane.
 
     The planes must be 1.5 thicknesses apart at the point, so that parts of one surface are
@@ -474,7 +467,7 @@ def assign_levels(
         moved &= offset[:, 0, 1].abs() <= _LEVEL_REACH * planes.thickness[other]
         return label.index_copy(0, both[moved], other[moved])
 
-    return _reassign(cloud, adjacency, labels, planes, flat, choose)
+    return _reassign(cloud, labels, planes, flat, choose)
 
 
 def _choose_regions(
@@ -511,28 +504,26 @@ def _choose_regions(
     members = torch.where(lists.mask(), lists.gather(labels), UNLABELED)
     columns = [lists.gather(column).double() for column in cloud.points.unbind(dim=1)]
     # A rounded edge is as far from a precise plane as from a rough one: both have one unit.
-    scale = torch.maximum(planes.thickness[pair[0]], planes.thickness[pair[1]])
+    sq_scale = torch.maximum(planes.thickness[pair[0]], planes.thickness[pair[1]]).square()
     costs = []
     for one, other in (pair, pair[::-1]):
-        height = planes.signed_distances(position, one)
-        foot = position - height[:, None] * planes.normal[one]
-        over = _overshoot(planes, foot, columns, members == one[:, None], (one, other))
-        excess = (height.square() + over.square()) / scale.square()
-        costs.append(excess + _ROUNDING**2 * (one != label))
+        excess = _excess(planes, position, columns, members == one[:, None], (one, other))
+        costs.append(excess / sq_scale + _ROUNDING**2 * (one != label))
     return choice.index_copy(0, both, torch.where(costs[1] < costs[0], pair[1], pair[0]))
 
 
-def _overshoot(
+def _excess(
     planes: RegionPlanes,
-    foot: Tensor,
+    position: Tensor,
     columns: list[Tensor],
     inside: Tensor,
     pair: tuple[Tensor, Tensor],
 ) -> Tensor:
-    """Return how far the projections of points lie beyond the plane at which their region ends.
+    """Return the sum of the squared distance to a plane and the squared overshoot.
 
-    ``foot`` ``(n, 3)`` are the projections, ``columns`` are the coordinates of the neighbors ``(n,
-    K)``, ``inside`` masks those in the region. A ``pair`` is the region and the other plane.
+    The latter is how far the projection of a point lies beyond the plane at which its region ends.
+    ``columns`` are the coordinates of the neighbors ``(n, K)``, ``inside`` masks those in the
+    region. A ``pair`` is the region and the other plane.
     """
     (label, other), offset = pair, torch.zeros_like(columns[0])
     plane = planes.center[other].T, planes.normal[other].T
@@ -542,5 +533,7 @@ def _overshoot(
     total = offset.sum(dim=1)
     rounding = _ROUNDING * planes.thickness[label] * inside.sum(dim=1)
     one_sided = total.abs() > (_MIN_ONE_SIDED * offset.abs().sum(dim=1)).clamp(min=rounding)
+    height = planes.signed_distances(position, label)
+    foot = position - height[:, None] * planes.normal[label]
     over = -total.sign() * planes.signed_distances(foot, other)
-    return torch.where(one_sided, over.clamp(min=0), 0.0)
+    return height.square() + torch.where(one_sided, over.clamp(min=0), 0.0).square()

@@ -274,7 +274,8 @@ def _join_cores(cloud: GrowingInput, cores: Tensor, near: Neighbors, passed: Ten
         planes = fit_planes(Segments(cores, max_points=MAX_FITTED), cloud.points, cloud.normals)
         turn = unsigned_angle_deg(*planes.normal[pairs].unbind(dim=1))
         joined |= (pairwise_misfit(planes, pairs) < _MAX_MISFIT) & (turn <= _MAX_DIHEDRAL_DEG)
-    return remap_labels(cores, connected_components(num_cores, *pairs[joined].unbind(dim=1)))
+    owner, _ = connected_components(num_cores, *pairs[joined].unbind(dim=1))
+    return remap_labels(cores, owner.long())
 
 
 def _propagate(cores: Tensor, near: Neighbors, passed: Tensor) -> Tensor:
@@ -422,8 +423,8 @@ def connected_points(groups: Tensor, nearest: Tensor) -> Tensor:
     own = index[rows, None].expand_as(near)
     # A link of a point to itself joins nothing.
     ends = torch.where(groups[near] == groups[rows, None], index[near], own)
-    found = connected_components(len(rows), own.reshape(-1), ends.view(-1))
-    return index.index_copy_(0, rows, found)
+    found, _ = connected_components(len(rows), own.reshape(-1), ends.view(-1))
+    return index.index_copy_(0, rows, found.long())
 
 
 def _have_valleys(

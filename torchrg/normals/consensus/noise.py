@@ -79,22 +79,16 @@ def estimate_noise(
 
     map_chunks(work, len(points), chunk_size, points.device)
     floor = torch.maximum(coordinate_resolution(points), coordinate_resolution(radius[:, None]))
-    single, layered, *small = _neighbor_quantiles(
-        deviations, neighbors, constants.NOISE_QUANTILE
-    ).unbind(dim=1)
+    quantiles = _neighbor_quantiles(deviations, neighbors, constants.NOISE_QUANTILE)
+    single, layered, *small = quantiles.unbind(dim=1)
     noise = constants.NOISE_FACTOR_OF_ALL * torch.minimum(single, layered)
-    count: Tensor | int = neighbors.indices.shape[1]
+    counts: Tensor | int = neighbors.indices.shape[1]
     if neighbors.valid is not None:
-        count = neighbors.valid.sum(dim=1)
-    factors, limits = constants.NOISE_FACTORS, constants.NOISE_LIMITS
-    for size, factor, limit, values in zip(
-        constants.NOISE_COUNTS, factors, limits, small, strict=True
-    ):
-        noise_of_size = factor * values
-        near = (
-            radius
-            * (size / torch.as_tensor(count, dtype=radius.dtype, device=radius.device)).sqrt()
-        )
+        counts = neighbors.valid.sum(dim=1)
+    counts = torch.as_tensor(counts, dtype=radius.dtype, device=radius.device)
+    sizes = constants.NOISE_COUNTS, constants.NOISE_FACTORS, constants.NOISE_LIMITS
+    for size, factor, limit, values in zip(*sizes, small, strict=True):
+        noise_of_size, near = factor * values, radius * (size / counts).sqrt()
         fraction = noise_of_size / torch.where(radius > 0, limit * near, 1.0)
         below = (1 - fraction * fraction).clamp_(min=0)
         scaled = noise_of_size / torch.where(below > 0, below, 1.0).sqrt_()
@@ -130,19 +124,10 @@ def _measure_neighborhoods(
     """
     counts = constants.NOISE_COUNTS
     if kernels.serve(points, *near, normals, valid, k=near.indices.shape[1]):
-        return kernels.call(
-            "survey",
-            points,
-            *near,
-            normals,
-            valid,
-            *counts,
-            constants.MIN_BREADTH,
-            constants.MAX_LAYERED_KURTOSIS,
-            constants.MAX_LAYERED_FRACTION,
-            constants.NUM_REFITS,
-            constants.MIN_PLANE_POINTS,
-        )
+        layers = constants.MAX_LAYERED_KURTOSIS, constants.MAX_LAYERED_FRACTION
+        numbers = constants.NUM_REFITS, constants.MIN_PLANE_POINTS
+        limits = *counts, constants.MIN_BREADTH, *layers, *numbers
+        return kernels.call("survey", points, *near, normals, valid, *limits)
     columns = gather_columns(points, near.indices)
     counted = near.mask().to(points.dtype)
     count, offsets, distances = _center_planes(columns, counted, normals)

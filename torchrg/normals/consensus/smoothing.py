@@ -49,17 +49,12 @@ def smooth_planes(
     """
     are_served = kernels.serve(points, *neighbors, *planes, noise, k=neighbors.indices.shape[1])
     table = _table(points, planes, errors) if are_served else points
-    parameters = (
-        constants.SMOOTHING_AGREEMENT,
-        constants.SMOOTHING_REACH,
-        constants.FIT_FALLOFF,
-        constants.TILT_RIDGE,
-        constants.MAX_TILT,
-    )
+    limits = constants.SMOOTHING_AGREEMENT, constants.SMOOTHING_REACH, constants.FIT_FALLOFF
+    tilt = constants.TILT_RIDGE, constants.MAX_TILT
 
     def find(chosen: Tensor) -> Sequence[Tensor]:
         if are_served:
-            return kernels.call("smooth_planes", table, *neighbors, noise, chosen, *parameters)
+            return kernels.call("smooth_planes", table, *neighbors, noise, chosen, *limits, *tilt)
         return _smooth_rows(points, neighbors, planes, noise, errors, chosen)
 
     return _replace_planes(planes, rows, chunk_size, find)
@@ -137,21 +132,16 @@ def choose_planes(
     planes.
     """
     ranks = torch.arange(0, neighbors.indices.shape[1], constants.CHOICE_STEP, device=rows.device)
-
     are_served = kernels.serve(points, *neighbors, *planes, noise, k=neighbors.indices.shape[1])
     are_served = are_served and len(rows) > 0
     table = _table(points, planes, noise) if are_served else points
-    parameters = (
-        constants.CHOICE_STEP,
-        constants.VOTE_REACH,
-        constants.VOTE_FALLOFF,
-        constants.INLIER_REACH,
-        constants.CHOICE_COST,
-    )
+    vote = constants.CHOICE_STEP, constants.VOTE_REACH, constants.VOTE_FALLOFF
+    limits = constants.INLIER_REACH, constants.CHOICE_COST
 
     def find(chosen: Tensor) -> Sequence[Tensor]:
         if are_served:
-            return kernels.call("choose_planes", table, *neighbors, points, chosen, *parameters)
+            arguments = table, *neighbors, points, chosen, *vote, *limits
+            return kernels.call("choose_planes", *arguments)
         return _best_neighbor_planes(points, neighbors, planes, noise, chosen, ranks)
 
     at_once = ROWS_IN_CACHE // (1 if are_served else len(ranks))

@@ -114,19 +114,12 @@ def broken_planes(
     :func:`torchrg.normals.consensus.hypotheses.fit_meeting_planes`.
     """
     if kernels.serve(points, *near, noise, normals, k=near.indices.shape[1]) and len(noise):
-        parameters = (
-            constants.VOTE_REACH,
-            constants.VOTE_FALLOFF,
-            constants.FIT_REACH,
-            constants.FIT_FALLOFF,
-            constants.MEETING_GAP,
-            constants.CORNER_LIMIT,
-            constants.CORNER_FRACTION,
-            constants.NUM_REFITS,
-            constants.NUM_ALTERNATIONS,
-            constants.MIN_PLANE_POINTS,
-        )
-        tables = candidate_ranks(_count_each(near)), torch.tensor(parameters, dtype=torch.float32)
+        vote = constants.VOTE_REACH, constants.VOTE_FALLOFF
+        fit = constants.FIT_REACH, constants.FIT_FALLOFF
+        meeting = constants.MEETING_GAP, constants.CORNER_LIMIT, constants.CORNER_FRACTION
+        counts = constants.NUM_REFITS, constants.NUM_ALTERNATIONS, constants.MIN_PLANE_POINTS
+        parameters = torch.tensor([*vote, *fit, *meeting, *counts], dtype=torch.float32)
+        tables = candidate_ranks(_count_each(near)), parameters
         fits = kernels.call("broken_planes", points, *near, noise, normals, *tables)
         return TangentPlanes(*fits[:2]), MeetingPlanes(*fits[2:])
     columns = _gather_counted(points, near)
