@@ -82,9 +82,11 @@ def refine_regions(
         # nearest points belong to the adjacent surfaces.
         width = (SQ_WIDTH * eigh3_lapack(planes.covariance)[0][:, 1].clamp(min=0)).sqrt()
         are_strips = ~planes.curved & (width <= planes.radius)
-        strips = labels.where(value_of_points(are_strips, labels, False), UNLABELED)
-        found = adjacency.contacts(labels), find_region_pairs(strips, cloud.neighbors)
-        pairs, counts = map(torch.cat, zip(*found, strict=True))
+        contacts = [adjacency.contacts(labels)]
+        if int(torch.count_nonzero(are_strips)) > 1:
+            strips = labels.where(value_of_points(are_strips, labels, False), UNLABELED)
+            contacts.append(find_region_pairs(strips, cloud.neighbors))
+        pairs, counts = map(torch.cat, zip(*contacts, strict=True))
         labels = merge_coplanar(labels, (pairs, counts), planes, tolerance=config.merge_tolerance)
     if config.refine_borders:
         labels = remove_small(labels, 1)
@@ -99,8 +101,8 @@ def refine_regions(
             # growth crosses it on one plane: regions still apart, such as cushions side by side,
             # are surfaces of their own. Results of rooms are equal with 4 to 16 neighbors.
             faceted = config.faceted is True
-            contacts = find_region_pairs(labels, cloud.neighbors) if faceted else None
-            labels = merge_facets(labels, contacts or adjacency.contacts(labels), planes, config)
+            near = find_region_pairs(labels, cloud.neighbors) if faceted else None
+            labels = merge_facets(labels, near or adjacency.contacts(labels), planes, config)
     return labels
 
 
@@ -243,18 +245,13 @@ def merge_facets(
 
 
 class _Moments(NamedTuple):
-    """Moments of regions, their coplanarity scale, and the noise they lend to smaller regions.
-
-    ``normal`` ``(M, 3)`` is the axis of minimum variance ``(M,)``.
-    """
+    """Moments of regions, their coplanarity scale, and the noise they lend to smaller regions."""
 
     weight: Tensor
     mean: Tensor
     covariance: Tensor
     scale: Tensor
     noise: Tensor
-    min_variance: Tensor
-    normal: Tensor
 
     def select(self, rows: Tensor | slice) -> "_Moments":
         """Return the moments of the given regions."""
@@ -264,15 +261,12 @@ class _Moments(NamedTuple):
 def _region_moments(planes: RegionPlanes) -> _Moments:
     normal = planes.normal
     variance = (normal[:, None] @ planes.covariance @ normal[:, :, None])[:, 0, 0]
-    values, axes = eigh3_lapack(planes.covariance)
     return _Moments(
         planes.num_points.double(),
         planes.center - planes.center[:1],
         planes.covariance,
         torch.where(planes.curved, 0.0, torch.maximum(variance.clamp(min=0).sqrt(), planes.floor)),
         planes.noise,
-        values[:, 0],
-        axes[:, :, 0],
     )
 
 
@@ -284,7 +278,7 @@ def pairwise_misfit(planes: RegionPlanes, pairs: Tensor) -> Tensor:
     thickness = planes.thickness[pairs].amax(dim=1)
     moments = _region_moments(planes)
     first, second = (moments.select(side)._replace(scale=thickness) for side in pairs.unbind(dim=1))
-    return _misfit(first, second, _combined(first, second))
+    return _misfit(first, second)
 
 
 def _merge(
@@ -304,7 +298,7 @@ def _merge(
     def offer(pairs: Tensor) -> None:
         pairs = pairs.sort(dim=1).values
         first, second = (groups.select(side) for side in pairs.unbind(dim=1))
-        misfits = _misfit(first, second, _combined(first, second), bounds)
+        misfits = _misfit(first, second, bounds)
         for (a, b), misfit in zip(pairs.tolist(), misfits.tolist(), strict=True):
             adjacent[a].add(b)
             adjacent[b].add(a)
@@ -347,28 +341,27 @@ def _combined(a: _Moments, b: _Moments) -> _Moments:
         covariance = covariance + fraction[:, :, None] * spread
     noise = torch.where(a.weight >= b.weight, a.noise, b.noise)
     scale = (fraction_a[:, 0] * a.scale.square() + fraction_b[:, 0] * b.scale.square()).sqrt()
-    values, axes = eigh3_lapack(covariance)
-    return _Moments(weight, mean, covariance, scale, noise, values[:, 0], axes[:, :, 0])
+    return _Moments(weight, mean, covariance, scale, noise)
 
 
-def _misfit(
-    a: _Moments, b: _Moments, both: _Moments, bounds: tuple[float, float] | None = None
-) -> Tensor:
+def _misfit(a: _Moments, b: _Moments, bounds: tuple[float, float] | None = None) -> Tensor:
     """Return the larger of both regions' RMS distances to the joint plane, in their own scales.
 
     With ``bounds`` it is infinite if the joint plane is tilted too far against the plane of either
     region, or too far from its mean: the maximum RMS distance by the tilt, and that of the mean.
     """
-    misfits, normal = [], both.normal
-    for side, other in ((a, b), (b, a)):
+    both, misfits = _combined(a, b), []
+    variances, axes = eigh3_lapack(torch.stack([m.covariance for m in (both, a, b)]))
+    normal, *normals = axes[..., 0].unbind()
+    for side, other, least, own in zip((a, b), (b, a), variances[1:, :, 0], normals, strict=True):
         variance = (normal[:, None] @ side.covariance @ normal[:, :, None])[:, 0, 0]
         shift = ((side.mean - both.mean) * normal).sum(dim=1)
         rms = (variance.clamp(min=0) + shift * shift).sqrt()
         lent = torch.where(other.weight > side.weight, other.noise, 0.0)
         misfits.append(torch.where(rms > 0, rms / torch.maximum(side.scale, lent), 0.0))
         if bounds is not None:
-            apart = (side.normal * normal).sum(dim=1).abs() < _MIN_FACET_COSINE
-            apart |= variance - side.min_variance > bounds[0] ** 2
+            apart = (own * normal).sum(dim=1).abs() < _MIN_FACET_COSINE
+            apart |= variance - least > bounds[0] ** 2
             misfits[-1].masked_fill_(apart | (shift.abs() > bounds[1]), torch.inf)
     return torch.maximum(*misfits)
 
