@@ -18,7 +18,8 @@ def connected_components(
     """
     links = starts.cpu().int(), ends.cpu().int()
     flips = torch.zeros_like(links[0], dtype=torch.bool) if is_flipped is None else is_flipped
-    forest = (torch.arange(num_nodes, dtype=torch.int32), *torch.zeros(2, num_nodes).bool())
+    marks = torch.zeros(2, num_nodes, dtype=torch.bool)
+    forest = torch.arange(num_nodes, dtype=torch.int32), marks[0], marks[1]
     if kernels.serve():
         kernels.call("link_nodes", *links, flips, *forest)
         kernels.call("flatten_nodes", *forest)

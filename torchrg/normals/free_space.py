@@ -35,6 +35,11 @@ _HALF_DIRECTIONS = [steps for steps in product((-1, 0, 1), repeat=3) if steps > 
 """Thirteen of the 26 directions to neighboring cells, without their opposites."""
 _STRIDES = [math.sqrt(sum(map(abs, steps))) for steps in _HALF_DIRECTIONS]
 """Their lengths, in cells."""
+_ENDS = [
+    [[(i if d == sign else i + 3) if d else 6 for i, d in enumerate(s)] for s in _HALF_DIRECTIONS]
+    for sign in (1, -1)
+]
+"""Ends of the bounding box along each axis: upper ones from 0, lower ones from 3, 6 for none."""
 
 
 def vote_free_side(
@@ -134,9 +139,8 @@ def _weigh_paths(free: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
     Paths have ``free`` cells up to an obstacle, or -1. The bounding box ends ``lower`` cells before
     their start along each axis, and ``upper`` cells after it, ``(3, n)``.
     """
-    steps, is_open = torch.tensor(_HALF_DIRECTIONS)[:, :, None], free < 0
-    ends = (torch.where(steps > 0, *sides) for sides in ((upper, lower), (lower, upper)))
-    to_ends = torch.stack([end.masked_fill(steps == 0, _MAX_CELLS).amin(dim=1) for end in ends])
+    ends = torch.cat([upper, lower, torch.full_like(upper[:1], _MAX_CELLS)])
+    to_ends, is_open = ends[torch.tensor(_ENDS)].amin(dim=2), free < 0
     strides = torch.tensor(_STRIDES, dtype=torch.float32)[:, None]
     path = strides * torch.where(is_open, to_ends, free)
     weight = path / (path + _HALF_PATH)

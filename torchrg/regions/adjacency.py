@@ -180,9 +180,12 @@ class _RegionEdges:
         rows = nonzero_rows(self._labels >= 0).to(torch.int32)
         self._chunks = torch.split(rows, at_once)
         self._kept = self._find(rows) if len(self._chunks) == 1 else None
-        found = self._map(lambda edges: (torch.unique_consecutive(edges[0]), edges[3].clone()))
-        rows, keys = (torch.cat(parts) for parts in zip(*found, strict=True))
-        self._chunks = torch.split(rows, at_once)
+        if self._kept is None:
+            found = self._map(lambda edges: (torch.unique_consecutive(edges[0]), edges[3].clone()))
+            rows, keys = (torch.cat(parts) for parts in zip(*found, strict=True))
+            self._chunks = torch.split(rows, at_once)
+        else:
+            keys = self._kept[3]
         if self._num_regions**2 <= len(labels):
             # A table of all pairs is faster than a sort.
             table = torch.bincount(keys)
