@@ -15,7 +15,7 @@ from torchrg._checks import as_tensor, check_floating, check_shapes, eager_only
 from torchrg._parallel import CHUNK_SIZE, limit_rows
 from torchrg.config import AnyConfig, GrowingConfig, settings_of
 from torchrg.errors import ConfigError, ShapeError
-from torchrg.linalg.moments import kth_smallest, to_column_major
+from torchrg.linalg.moments import to_column_major
 from torchrg.linalg.precision import is_single, to_single
 from torchrg.neighbors import canonical_order, measure_sampling
 from torchrg.neighbors.knn import check_neighbors
@@ -284,8 +284,9 @@ def grow(cloud: GrowingInput, config: GrowingConfig, chunk_size: int) -> Tensor:
     curvature, valid, indices = (column.cpu() for column in columns)
     # Invalid points are last.
     curvature, num_valid = curvature.where(valid, torch.inf), int(torch.count_nonzero(valid))
-    limit = kth_smallest(curvature, max(int(config.curvature_quantile * (num_valid - 1)), 0))
-    is_seed, order = curvature <= limit, ascending_rows(curvature)[:num_valid].int()
+    order = ascending_rows(curvature)
+    limit = curvature[order[max(int(config.curvature_quantile * (num_valid - 1)), 0)]]
+    is_seed, order = curvature <= limit, order[:num_valid].int()
     on_device = limit.to(cloud.points.device)
     joins, makes_seed = mark_edges(cloud, config, on_device, chunk_size=chunk_size)
     if makes_seed is None and int(config.min_size) > indices.shape[1]:
@@ -328,25 +329,19 @@ def grow_fifo(
     joined = _unpack(joins, width)
     promotes = is_seed.numpy()[lists] if makes_seed is None else _unpack(makes_seed, width)
 
-    def claim(root: np.integer, seed: np.integer, *, promoted: bool) -> NDArray[np.integer]:
-        """Assign unassigned neighbors of a seed to a region, and return the new seeds."""
-        claims = joined[seed] & free[lists[seed]]
-        if promoted:
-            claims &= promotes[seed]
-        targets = lists[seed][claims]
-        free[targets], roots[targets] = False, root
-        new: NDArray[np.integer] = targets[promotes[seed][claims]]
-        return new
-
     for root in order.numpy():
         if not free[root]:
             continue
-        free[root], roots[root] = False, root
-        queue = [root]
-        for seed in queue:
-            queue.extend(claim(root, seed, promoted=late))
-        for seed in queue if late else ():
-            claim(root, seed, promoted=False)
+        free[root], roots[root], queue = False, root, [root]
+        for seeds_alone in (True, False) if late else (False,):
+            for seed in queue:
+                claims = joined[seed] & free[lists[seed]]
+                if seeds_alone:
+                    claims &= promotes[seed]
+                targets = lists[seed][claims]
+                free[targets], roots[targets] = False, root
+                if seeds_alone or not late:
+                    queue.extend(targets[promotes[seed][claims]])
     return torch.from_numpy(roots)
 
 
