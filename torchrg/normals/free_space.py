@@ -8,11 +8,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrg import kernels
+from torchrg import kernels, scratch
 from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_chunks, map_tasks
-from torchrg.linalg.moments import dot, kth_smallest
+from torchrg.linalg.moments import dot, kth_smallest, project, sq_lengths
+from torchrg.neighbors.knn import gather_columns
 from torchrg.neighbors.order import sort_integers
 from torchrg.normals.faces import gather_lists
+from torchrg.structures import Neighbors
 from torchrg.structures.points import bounding_box
 
 _SPACINGS_PER_CELL = 1.5
@@ -117,15 +119,13 @@ def _find_obstacles(
     points: Tensor, normals: Tensor, near: Tensor, rows: Tensor, width: float
 ) -> list[Tensor]:
     """Return the weights of paths to the nearest neighboring faces ahead and behind."""
-    ranks, normal = list(range(min(_NUM_OBSTACLES, near.shape[1]))), normals[rows, None]
-    ends = gather_lists(near, rows, ranks)
-    positions, others = (
-        values.index_select(0, ends.view(-1)).view(*ends.shape, 3) for values in (points, normals)
-    )
-    offsets = positions - points[rows, None]
-    height = dot(offsets, normal)
-    is_face = dot(others, normal).abs() > _MIN_PARALLEL_COSINE
-    is_face &= height * height > _MIN_ELEVATION_SINE * _MIN_ELEVATION_SINE * dot(offsets, offsets)
+    ends = near[:, :_NUM_OBSTACLES].index_select(0, rows)
+    scratch.release()
+    offsets, normal = gather_columns(points, ends), normals[rows]
+    x, y, z = (Neighbors(ends).gather(column) for column in normals.unbind(dim=1))
+    height = project(offsets, normal)
+    is_face = project((x, y, z), normal).abs() > _MIN_PARALLEL_COSINE
+    is_face &= height * height > _MIN_ELEVATION_SINE * _MIN_ELEVATION_SINE * sq_lengths(offsets)
     nearest = (
         torch.where(is_face & (above > 0), above, torch.inf).amin(dim=1)
         for above in (height, -height)
