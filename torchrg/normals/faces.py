@@ -13,8 +13,7 @@ from torch import Tensor
 from torchrg import kernels, scratch
 from torchrg._parallel import ROWS_AT_ONCE, ROWS_IN_CACHE, map_tasks, nonzero_rows, split_rows
 from torchrg.linalg.moments import dot
-from torchrg.neighbors.components import connected_components
-from torchrg.neighbors.order import mark_distinct, sort_integers
+from torchrg.neighbors.order import connected_components, mark_distinct, sort_integers
 
 _RANKS = (2, 4, 6, 9, 12, 15)
 """Neighbor ranks over which faces spread. Noise tilts the links to nearer ones."""

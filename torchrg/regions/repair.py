@@ -353,15 +353,15 @@ def _misfit(a: _Moments, b: _Moments, bounds: tuple[float, float] | None = None)
     both, misfits = _combined(a, b), []
     variances, axes = eigh3_lapack(torch.stack([m.covariance for m in (both, a, b)]))
     normal, *normals = axes[..., 0].unbind()
-    for side, other, least, own in zip((a, b), (b, a), variances[1:, :, 0], normals, strict=True):
+    for side, other, lowest, axis in zip((a, b), (b, a), variances[1:, :, 0], normals, strict=True):
         variance = (normal[:, None] @ side.covariance @ normal[:, :, None])[:, 0, 0]
         shift = ((side.mean - both.mean) * normal).sum(dim=1)
         rms = (variance.clamp(min=0) + shift * shift).sqrt()
         lent = torch.where(other.weight > side.weight, other.noise, 0.0)
         misfits.append(torch.where(rms > 0, rms / torch.maximum(side.scale, lent), 0.0))
         if bounds is not None:
-            apart = (own * normal).sum(dim=1).abs() < _MIN_FACET_COSINE
-            apart |= variance - least > bounds[0] ** 2
+            apart = (axis * normal).sum(dim=1).abs() < _MIN_FACET_COSINE
+            apart |= variance - lowest > bounds[0] ** 2
             misfits[-1].masked_fill_(apart | (shift.abs() > bounds[1]), torch.inf)
     return torch.maximum(*misfits)
 

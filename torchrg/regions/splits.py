@@ -16,7 +16,7 @@ from torchrg.config import GrowingConfig
 from torchrg.linalg import unsigned_angle_deg
 from torchrg.linalg.angles import deg_to_sq_chord, sq_chords
 from torchrg.linalg.moments import Segments, sum_neighbors
-from torchrg.neighbors.components import connected_components
+from torchrg.neighbors.order import connected_components
 from torchrg.regions.adjacency import PARALLEL_DEG, KnnAdjacency
 from torchrg.regions.edges import GrowingInput, accept_edges, within_angle
 from torchrg.regions.fit import MAX_FITTED, RegionPlanes, fit_planes, fit_regions
@@ -420,10 +420,10 @@ def connected_points(groups: Tensor, nearest: Tensor) -> Tensor:
     rows = nonzero_rows(groups >= 0)
     near, index = nearest[rows].long(), torch.full_like(groups, UNLABELED)
     index[rows] = torch.arange(len(rows), device=rows.device)
-    own = index[rows, None].expand_as(near)
+    itself = index[rows, None].expand_as(near)
     # A link of a point to itself joins nothing.
-    ends = torch.where(groups[near] == groups[rows, None], index[near], own)
-    found, _ = connected_components(len(rows), own.reshape(-1), ends.view(-1))
+    ends = torch.where(groups[near] == groups[rows, None], index[near], itself)
+    found, _ = connected_components(len(rows), itself.reshape(-1), ends.view(-1))
     return index.index_copy_(0, rows, found.long())
 
 

@@ -8,7 +8,7 @@ import torch
 from scipy.sparse import coo_array, csgraph
 
 from tests.kernels.clouds import definitions, needs_library
-from torchrg.neighbors.components import connected_components
+from torchrg.neighbors.order import connected_components
 
 
 @pytest.fixture(params=[True, False], ids=["kernels", "definition"])
