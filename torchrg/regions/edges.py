@@ -239,13 +239,12 @@ def are_coplanar(
     # |(p_j - p_i) . n_i|, below eq. (10).
     residuals = project(offsets, cloud.normals[indices[:, 0].long()]).abs_()
     floor = floor_fraction * patch_radii(offsets, counted)
-    if compared is not None:
-        counted = compared[tested]
+    used = counted if compared is None else compared[tested]
     # The limit is at least twice the floor.
     far = mask[tested] & ~(residuals <= 2 * floor[:, None])
     rows = nonzero_rows(far.any(dim=1))
-    counted = None if counted is None else counted[rows]
-    limits = coplanarity_limits(residuals[rows], floor[rows], counted)
+    used = None if used is None else used[rows]
+    limits = coplanarity_limits(residuals[rows], floor[rows], used)
     far[rows] &= ~(residuals[rows] <= limits[:, None])
     result[tested] = mask[tested] & ~far
     return result

@@ -187,13 +187,8 @@ def checked_cloud(
     normals = as_tensor(caller, "normals", normals).detach()
     curvature = as_tensor(caller, "curvature", curvature).detach()
     valid = None if valid is None else as_tensor(caller, "valid", valid)
-    check_shapes(
-        caller,
-        points=(points, "N 3"),
-        normals=(normals, "N 3"),
-        curvature=(curvature, "N"),
-        valid=(valid, "N"),
-    )
+    vectors = {"points": (points, "N 3"), "normals": (normals, "N 3")}
+    check_shapes(caller, **vectors, curvature=(curvature, "N"), valid=(valid, "N"))
     check_floating(caller, points=points, normals=normals, curvature=curvature)
     check_neighbors(caller, neighbors, points)
     if valid is not None and valid.dtype != torch.bool:
