@@ -13,7 +13,7 @@ import math
 import os
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -98,6 +98,8 @@ _DTYPES = {
     "b": torch.bool,
 }
 """Dtypes by their letters in a signature."""
+_NUMBERS: dict[str, type[int] | type[float]] = {"n": int, "x": float}
+"""Types of numbers by their letters in a signature."""
 _SERVED = torch.float32, torch.int32, torch.bool
 """Dtypes of the tensors that kernels process."""
 _FIXED = {str(length): length for length in range(10)}
@@ -118,16 +120,14 @@ def serve(*tensors: Tensor | None, k: int = 1) -> bool:
         >>> serve(torch.zeros(3, dtype=torch.float64))
         False
     """
-    return (
-        _library() is not None
-        and 0 < k <= MAX_NEIGHBORS
-        and is_concrete(*tensors)
-        and all(
-            tensor is None
-            or (tensor.is_cpu and not tensor.requires_grad and tensor.dtype in _SERVED)
-            for tensor in tensors
-        )
-    )
+    if _library() is None or not 0 < k <= MAX_NEIGHBORS:
+        return False
+    for tensor in tensors:
+        if tensor is not None and (
+            tensor.dtype not in _SERVED or not tensor.is_cpu or tensor.requires_grad
+        ):
+            return False
+    return is_concrete(*tensors)
 
 
 def call(name: str, *arguments: Tensor | float | None) -> tuple[Tensor, ...]:
@@ -140,15 +140,23 @@ def call(name: str, *arguments: Tensor | float | None) -> tuple[Tensor, ...]:
     (inputs, outputs), library = _signature(name), _library()
     if library is None or len(arguments) != len(inputs):
         raise ValueError(f"{name}: expected {len(inputs)} arguments and a library.")
-    lengths = _FIXED.copy()
-    # The tensors stay referenced until the kernel has returned.
-    taken = [kind.take(name, value, lengths) for kind, value in zip(inputs, arguments, strict=True)]
+    lengths, passed, copies = _FIXED.copy(), list[float | None](), list[Tensor]()
+    for value, kind in zip(arguments, inputs, strict=True):
+        if isinstance(value, Tensor) and kind.fits(value, lengths):
+            if not value.is_contiguous():
+                value = value.contiguous()
+                copies.append(value)  # Stays referenced until the kernel has returned.
+            passed.append(value.data_ptr())
+        elif value is None and kind.is_optional:
+            passed.append(None)
+        elif kind.number and isinstance(value, (int, float)):
+            passed.append(kind.number(value))
+        else:
+            got = tuple(value.shape) if isinstance(value, Tensor) else value
+            raise ValueError(f"{name}: expected {kind.word}, got {got}, {lengths}.")
     # Separate lengths are parsed faster than a list.
-    found = [
-        torch.empty(*[lengths[axis] for axis in kind.axes], dtype=kind.dtype, device="cpu")
-        for kind in outputs
-    ]
-    passed = [v.data_ptr() if isinstance(v, Tensor) else v for v in (*taken, *found)]
+    found = [kind.new_empty(*map(lengths.__getitem__, kind.axes)) for kind in outputs]
+    passed += [tensor.data_ptr() for tensor in found]
     status = getattr(library, name)(*list(lengths.values())[len(_FIXED) :], *passed)
     if status == 1:
         raise IndexError(f"{name}: expected neighbor indices of existing rows, got others.")
@@ -157,51 +165,40 @@ def call(name: str, *arguments: Tensor | float | None) -> tuple[Tensor, ...]:
     return tuple(found)
 
 
-class _Argument(NamedTuple):
-    """Argument in a signature: its letter, axes, dtype, and whether it is optional."""
+class _Argument:
+    """Argument in a signature: its axes, the dtype or the type of a number, and its role."""
 
-    letter: str
-    axes: str
-    dtype: torch.dtype | None
-    optional: bool
+    def __init__(self, word: str) -> None:
+        self.word, self.axes = word, word[1:].strip("[]?")
+        self.dtype, self.number = _DTYPES.get(word[0].lower()), _NUMBERS.get(word[0])
+        self.is_optional, self.is_written = word.endswith("?"), word[0].isupper()
+        self.new_empty = torch.empty(0, dtype=self.dtype, device="cpu").new_empty
 
-    def take(
-        self, name: str, value: Tensor | float | None, lengths: dict[str, int]
-    ) -> Tensor | float | None:
-        """Return the argument as contiguous; record and check the lengths of its axes."""
-        if isinstance(value, Tensor):
-            shape, agrees = value.shape, value.dtype is self.dtype and value.is_cpu
-            if agrees and len(shape) == len(self.axes):
-                for axis, length in zip(self.axes, shape, strict=True):
-                    agrees &= lengths.setdefault(axis, length) == length
-                if agrees and (self.letter.islower() or value.is_contiguous()):
-                    return value.contiguous()
-        elif value is None and self.optional:
-            return None
-        elif value is not None and self.dtype is None:
-            return int(value) if self.letter == "n" else float(value)
-        got = tuple(value.shape) if isinstance(value, Tensor) else value
-        raise ValueError(f"{name}: expected {self.letter}[{self.axes}], got {got}, {lengths}.")
+    def fits(self, tensor: Tensor, lengths: dict[str, int]) -> bool:
+        """Return whether a tensor can be the argument; record the lengths of its axes."""
+        shape = tensor.shape
+        return (
+            tensor.dtype is self.dtype
+            and tensor.is_cpu
+            and len(shape) == len(self.axes)
+            and tuple(map(lengths.setdefault, self.axes, shape)) == shape
+            and (not self.is_written or tensor.is_contiguous())
+        )
 
 
 @cache
 def _signature(name: str) -> tuple[list[_Argument], list[_Argument]]:
     """Return the inputs and outputs of a kernel."""
     inputs, outputs = (side.split() for side in SIGNATURES[name].split("->"))
-    return [_argument(word) for word in inputs], [_argument(word) for word in outputs]
-
-
-def _argument(word: str) -> _Argument:
-    dtype = _DTYPES.get(word[0].lower())
-    return _Argument(word[0], word[1:].strip("[]?"), dtype, word.endswith("?"))
+    return [_Argument(word) for word in inputs], [_Argument(word) for word in outputs]
 
 
 def _types(name: str) -> list[Any]:
     """Return the types of the arguments of a kernel in C: the lengths of axes come first."""
     inputs, outputs = _signature(name)
     lengths = {axis for kind in inputs for axis in kind.axes if axis not in _FIXED}
-    numbers: dict[str, Any] = {"n": ctypes.c_int64, "x": ctypes.c_double}
-    kinds = [numbers.get(kind.letter, ctypes.c_void_p) for kind in inputs + outputs]
+    numbers: dict[Any, Any] = {int: ctypes.c_int64, float: ctypes.c_double}
+    kinds = [numbers.get(kind.number, ctypes.c_void_p) for kind in inputs + outputs]
     return [ctypes.c_int64] * len(lengths) + kinds
 
 
