@@ -1,5 +1,6 @@
 import itertools
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -148,6 +149,20 @@ def test_qn_exceeds_next_to_the_threshold(dtype, rng):
         for length in (np.nextafter(step, kind(0)), step, np.nextafter(step, kind(9))):
             row = torch.tensor([0.0, float(length)], dtype=dtype)
             assert qn_exceeds(row, threshold).item() == (qn(row) > threshold).item()
+
+
+@pytest.mark.parametrize("n", [2, 9, 16, 51, 300])
+def test_values_left_by_a_mask_are_used_alone(n, dtype, rng):
+    rows = rows_of_all_kinds(n, dtype, rng).repeat(3, 1)
+    mask = torch.rand(rows.shape, generator=rng) < torch.linspace(0, 1.2, 33)[:, None]
+    finite = torch.where(rows.isfinite(), rows, 1.0).requires_grad_()
+    for function in (median, mad, qn, partial(qn, finite_sample=True), tau):
+        found = function(rows, mask=mask)
+        alone = torch.stack([function(r[m]) for r, m in zip(rows, mask, strict=True)])
+        torch.testing.assert_close(found, alone, rtol=0, atol=0, equal_nan=True)
+        total = function(finite, mask=mask)[mask.any(dim=1)].sum()
+        (gradient,) = torch.autograd.grad(total, finite)
+        assert gradient[~mask].eq(0).all()
 
 
 def test_masked_values_do_not_count(dtype, rng):

@@ -362,14 +362,24 @@ struct Job {
 
 }  // namespace
 
-// torchrg.robust.scale._majority_difference of sorted rows; NaN where a difference is not finite.
-KERNEL majority_differences(int64_t num_rows, int64_t n, Floats rows, float* found) {
+// torchrg.robust.scale._majority_difference of the first `counts` values of sorted rows, or of all;
+// NaN where a difference is not finite. Eight rows with equal counts share the lanes.
+KERNEL majority_differences(int64_t num_rows, int64_t n, Floats rows, Longs counts, float* found) {
   if (n < 2 || n > MAX_WIDTH) return TOO_WIDE;
   Column lanes;
-  for (int64_t i = 0; i < num_rows; i += LANES) {
-    for (int l = 0; l < LANES; l++)
-      for (int k = 0; k < n; k++) lanes.at(k, l) = rows[smaller(i + l, num_rows - 1) * n + k];
-    store_row(found, i, num_rows, majority_difference(lanes, int(n)));
+  for (int64_t i = 0; i < num_rows; i++) found[i] = 0;
+  for (int64_t count = counts ? 2 : n; count <= n; count++) {
+    int64_t chosen[LANES];
+    int used = 0;
+    for (int64_t i = 0; i < num_rows; i++) {
+      if (!counts || counts[i] == count) chosen[used++] = i;
+      if (used == 0 || (used < LANES && i + 1 < num_rows)) continue;
+      for (int l = 0; l < LANES; l++)
+        for (int k = 0; k < count; k++) lanes.at(k, l) = rows[chosen[l < used ? l : 0] * n + k];
+      const Lanes differences = majority_difference(lanes, int(count));
+      for (int l = 0; l < used; l++) found[chosen[l]] = differences[l];
+      used = 0;
+    }
   }
   return DONE;
 }

@@ -155,39 +155,26 @@ def scale_of_rows(
     """
     if not torch.is_grad_enabled():
         rows = rows.detach()
-    if name == "median":
-        return _map_counts(rows, mask, _sorted_median)
-    if name == "mad":
-        return _map_counts(rows, mask, lambda ascending: MAD_FACTOR * _median_deviation(ascending))
-    if name == "tau":
-        return _map_counts(rows, mask, tau_of_sorted)
-    return _map_counts(
-        rows, mask, lambda ascending: qn_of_sorted(ascending, finite_sample=finite_sample)
-    )
-
-
-def _map_counts(rows: Tensor, mask: Tensor | None, of_sorted: Callable[[Tensor], Tensor]) -> Tensor:
-    """Apply a function of sorted rows ``(B, n)`` to rows ``(*, n)``, grouped by number of values.
-
-    Masked-out values become +inf, sort last, and are cut off. A NaN would sort behind them, so rows
-    with NaN are handled first.
-    """
     shape, n = rows.shape[:-1], rows.shape[-1]
-    rows = rows.reshape(shape.numel(), n)
-    if mask is None:
-        return of_sorted(sort_rows(rows.contiguous())).reshape(shape)
-    counted = mask.reshape(shape.numel(), n)
-    broken = (rows.isnan() & counted).any(dim=1)
-    ascending = sort_rows(torch.where(counted, rows, torch.inf))
-    counts = counted.sum(dim=1)
-    out = rows.new_full((len(rows),), torch.nan)
-    results: Tensor | None = None
-    for count in sorted(set(counts.tolist())) or [n]:
-        chosen = (counts == count) & ~broken
-        of_count = of_sorted(ascending[chosen][:, :count].contiguous())
-        results = out.to(of_count.dtype) if results is None else results
-        results[chosen] = of_count
-    return (out if results is None else results).reshape(shape)
+    if n == 0:
+        return rows.new_full(shape, torch.nan)
+    rows, counts = rows.reshape(shape.numel(), n).contiguous(), None
+    if mask is not None:
+        # Masked-out values become +inf and sort last, before NaN.
+        counted = mask.reshape(shape.numel(), n)
+        rows, counts = torch.where(counted, rows, torch.inf), counted.sum(dim=1)
+    ascending = sort_rows(rows)
+    undefined = ascending[:, -1].isnan()
+    if counts is not None:
+        undefined |= counts == 0
+    ascending = torch.where(undefined[:, None], 0.0, ascending)
+    scales: dict[Scale, Callable[[], Tensor]] = {
+        "median": lambda: median_of_sorted(ascending, counts),
+        "mad": lambda: MAD_FACTOR * _median_deviation(ascending, counts),
+        "qn": lambda: qn_of_sorted(ascending, counts, finite_sample=finite_sample),
+        "tau": lambda: tau_of_sorted(ascending, counts),
+    }
+    return torch.where(undefined, torch.nan, scales[name]()).reshape(shape)
 
 
 def sort_rows(rows: Tensor) -> Tensor:
@@ -197,37 +184,42 @@ def sort_rows(rows: Tensor) -> Tensor:
     return rows.sort(dim=1).values
 
 
-def median_of_sorted(rows: Tensor) -> Tensor:
-    """Median of each sorted row of ``(B, n)``: the mean of the middle two for an even n."""
-    count = rows.shape[1]
-    low, high = rows[:, (count - 1) // 2], rows[:, count // 2]
-    return low if count % 2 else low + (high - low) / 2
+def median_of_sorted(rows: Tensor, counts: Tensor | None = None) -> Tensor:
+    """Median of each sorted row of ``(B, n)``: the mean of the middle two for an even n.
+
+    In all scales, the first ``counts`` ``(B,)`` values of the rows are used, by default all.
+    """
+    if counts is None:
+        count = rows.shape[1]
+        low, high = rows[:, (count - 1) // 2], rows[:, count // 2]
+        return low if count % 2 else low + (high - low) / 2
+    middle = torch.stack([(counts - 1).clamp(min=0), counts], dim=1) // 2
+    low, high = rows.gather(1, middle).unbind(dim=1)
+    return torch.where(counts % 2 == 1, low, low + (high - low) / 2)
 
 
-def _sorted_median(rows: Tensor) -> Tensor:
-    """Median of each sorted row; NaN if the row is empty or contains NaN, which sorts last."""
-    if rows.shape[1] == 0:
-        return rows.new_full((len(rows),), torch.nan)
-    return torch.where(rows[:, -1].isnan(), torch.nan, median_of_sorted(rows))
-
-
-def _median_deviation(rows: Tensor) -> Tensor:
+def _median_deviation(rows: Tensor, counts: Tensor | None = None) -> Tensor:
     """Median of the absolute deviations of each sorted row from its median."""
-    return _sorted_median(sort_rows((rows - _sorted_median(rows)[:, None]).abs()))
+    center = median_of_sorted(rows, counts)
+    deviations = sort_rows((rows - center[:, None]).abs())
+    return torch.where(center.isfinite(), median_of_sorted(deviations, counts), torch.nan)
 
 
-def tau_of_sorted(rows: Tensor) -> Tensor:
+def tau_of_sorted(rows: Tensor, counts: Tensor | None = None) -> Tensor:
     """Tau scale of each sorted row of ``(B, n)``, shape ``(B,)``."""
-    if rows.shape[1] == 0:
-        return rows.new_full((len(rows),), torch.nan)
-    lanes = rows.t().contiguous()
-    spread = _median_deviation(rows)
+    n, spread, middle = (
+        rows.shape[1],
+        _median_deviation(rows, counts),
+        median_of_sorted(rows, counts),
+    )
+    counts = torch.full_like(middle, n, dtype=torch.int64) if counts is None else counts
+    counted = torch.arange(n, device=rows.device)[:, None] < counts
     unit = torch.where(spread > 0, spread, 1.0)
-    standard = (lanes - _sorted_median(rows)) / unit
-    weights = (1 - (standard / _TAU_WEIGHT_CUT) ** 2).clamp(min=0) ** 2
+    standard = (torch.where(counted, rows.t(), middle) - middle) / unit
+    weights = counted * (1 - (standard / _TAU_WEIGHT_CUT) ** 2).clamp(min=0) ** 2
     center = sum_points(weights * standard) / sum_points(weights)
-    squares = ((standard - center) ** 2).clamp(max=_TAU_SCALE_CUT**2)
-    variance = sum_points(squares) / (len(lanes) * _TAU_CONSISTENCY)
+    squares = counted * ((standard - center) ** 2).clamp(max=_TAU_SCALE_CUT**2)
+    variance = sum_points(squares) / (counts.double() * _TAU_CONSISTENCY).to(squares.dtype)
     return torch.where(spread > 0, unit * torch.where(spread > 0, variance, 1.0).sqrt(), spread)
 
 
@@ -254,12 +246,15 @@ def sum_points(values: Tensor) -> Tensor:
     return values[0]
 
 
-def qn_of_sorted(rows: Tensor, *, finite_sample: bool) -> Tensor:
+def qn_of_sorted(rows: Tensor, counts: Tensor | None = None, *, finite_sample: bool) -> Tensor:
     """Qn of each sorted row of ``(B, n)``, shape ``(B,)``."""
     n = rows.shape[1]
     if n < 2:
-        return rows.new_zeros(len(rows)) if n else rows.new_full((len(rows),), torch.nan)
-    return (qn_factor(n) if finite_sample else QN_FACTOR) * _majority_difference(rows)
+        return rows.new_zeros(len(rows))
+    differences = _majority_difference(rows, counts)
+    if finite_sample and counts is not None:
+        return rows.new_tensor([qn_factor(count) for count in range(n + 1)])[counts] * differences
+    return (qn_factor(n) if finite_sample else QN_FACTOR) * differences
 
 
 def qn_factor(n: int) -> float:
@@ -283,28 +278,40 @@ def half_size(n: int) -> int:
     return n // 2 + 1
 
 
-def _majority_difference(sorted_rows: Tensor) -> Tensor:
+def _majority_difference(sorted_rows: Tensor, counts: Tensor | None) -> Tensor:
     """Return the C(h, 2)-th smallest pairwise difference of each sorted row; NaN with a NaN.
 
     Two values at least h ranks apart enclose at least C(h + 1, 2) pairs that are no farther apart.
     Only lags 1 to h - 1 of the sorted row can contain the result.
     """
     if sorted_rows.requires_grad:
-        return _difference_of_pair(sorted_rows, _majority_difference(sorted_rows.detach()))
+        difference = _majority_difference(sorted_rows.detach(), counts)
+        return _difference_of_pair(sorted_rows, difference)
     if kernels.serve(sorted_rows, k=sorted_rows.shape[1]):
 
         def find(rows: slice) -> Tensor:
-            return kernels.call("majority_differences", sorted_rows[rows])[0]
+            counted = None if counts is None else counts[rows]
+            return kernels.call("majority_differences", sorted_rows[rows], counted)[0]
 
         parts = map_chunks(find, len(sorted_rows), ROWS_AT_ONCE, sorted_rows.device)
         differences = torch.cat(parts)
         infinite = differences.isnan().nonzero().squeeze(1)
         if len(infinite):
-            differences[infinite] = _difference_by_lags(sorted_rows[infinite])
+            counted = None if counts is None else counts[infinite]
+            differences[infinite] = _find_difference(sorted_rows[infinite], counted)
         return differences
-    if sorted_rows.shape[1] > _MAX_LISTED_VALUES:
-        return _difference_by_counts(sorted_rows)
-    return _difference_by_lags(sorted_rows)
+    return _find_difference(sorted_rows, counts)
+
+
+def _find_difference(sorted_rows: Tensor, counts: Tensor | None = None) -> Tensor:
+    """Implement :func:`_majority_difference` for all values and devices."""
+    if counts is None:
+        is_long = sorted_rows.shape[1] > _MAX_LISTED_VALUES
+        return (_difference_by_counts if is_long else _difference_by_lags)(sorted_rows)
+    found = sorted_rows.new_zeros(len(sorted_rows))
+    for count in set(counts.tolist()) - {0, 1}:
+        found[counts == count] = _find_difference(sorted_rows[counts == count, :count])
+    return found
 
 
 def _difference_by_counts(sorted_rows: Tensor) -> Tensor:
