@@ -15,7 +15,6 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
 import torch
 from threadpoolctl import ThreadpoolController
 from torch import Tensor
@@ -101,42 +100,44 @@ def map_tasks(
     if device.type != "cpu":
         return [work(task) for task in tasks]
     _retain_freed_memory()
+    if _THREADS.get() is None:
+        with sequential_operations():
+            return map_tasks(work, tasks, device)
     num_threads = min(allowed_threads(), len(tasks))
-    with sequential_operations():
-        if num_threads < 2:
-            return [work(task) for task in tasks]
-        results, waiting = {}, iter(list(enumerate(tasks)))
-        grad_enabled, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
+    if num_threads < 2:
+        return [work(task) for task in tasks]
+    results, waiting = {}, iter(list(enumerate(tasks)))
+    grad_enabled, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
 
-        def take_tasks() -> None:
-            token = _THREADS.set(1)
-            try:
-                with torch.inference_mode(inference), torch.set_grad_enabled(grad_enabled):
-                    for index, task in waiting:
-                        results[index] = work(task)
-            finally:
-                # Drain the queue after an error, so that no further task starts.
-                for _ in waiting:
-                    pass
-                _THREADS.reset(token)
-
-        pool, others = _started_threads(), list[Future[None]]()
+    def take_tasks() -> None:
+        token = _THREADS.set(1)
         try:
-            # No thread starts while the interpreter exits, or at the limit of a container.
-            with suppress(RuntimeError):
-                for _ in range(num_threads - 1):
-                    others.append(pool.submit(copy_context().run, take_tasks))
-            # The calling thread also processes tasks.
-            take_tasks()
+            with torch.inference_mode(inference), torch.set_grad_enabled(grad_enabled):
+                for index, task in waiting:
+                    results[index] = work(task)
         finally:
-            wait(others)
-            if len(others) < num_threads - 1:
-                # A started thread may hold the task whose own thread did not start.
-                _POOL.get().remove(pool)
-                pool.shutdown()
-        for other in others:
-            other.result()
-        return [results[index] for index in range(len(tasks))]
+            # Drain the queue after an error, so that no further task starts.
+            for _ in waiting:
+                pass
+            _THREADS.reset(token)
+
+    pool, others = _started_threads(), list[Future[None]]()
+    try:
+        # No thread starts while the interpreter exits, or at the limit of a container.
+        with suppress(RuntimeError):
+            for _ in range(num_threads - 1):
+                others.append(pool.submit(copy_context().run, take_tasks))
+        # The calling thread also processes tasks.
+        take_tasks()
+    finally:
+        wait(others)
+        if len(others) < num_threads - 1:
+            # A started thread may hold the task whose own thread did not start.
+            _POOL.get().remove(pool)
+            pool.shutdown()
+    for other in others:
+        other.result()
+    return [results[index] for index in range(len(tasks))]
 
 
 @contextmanager
@@ -247,5 +248,5 @@ def nonzero_rows(mask: Tensor) -> Tensor:
     """Return the flat indices of True elements, shape ``(n,)``, int64."""
     if mask.device.type == "cpu":
         # Ten times faster than nonzero in torch, and than indexing with the mask.
-        return torch.from_numpy(np.flatnonzero(mask.numpy()))
+        return torch.from_numpy(mask.numpy().ravel().nonzero()[0])
     return mask.reshape(-1).nonzero().squeeze(1)

@@ -120,12 +120,12 @@ def _jacobi(
     # Multiplying by the reciprocal of a tiny scale would overflow for denormal input.
     a = [[scaled[..., min(i, j), max(i, j)].contiguous() for j in range(3)] for i in range(3)]
     one, zero = torch.ones_like(a[0][0]), torch.zeros_like(a[0][0])
-    v = [[one if i == j else zero for j in range(3)] for i in range(3)]
+    v = [torch.stack([one if i == j else zero for i in range(3)]) for j in range(3)]
     for _ in range(_JACOBI_SWEEPS):
         for p, q, r in ((0, 1, 2), (0, 2, 1), (1, 2, 0)):
             _rotate(a, v, (p, q, r), root)
     values = torch.stack([a[i][i] for i in range(3)], dim=-1)
-    vectors = torch.stack([torch.stack(row, dim=-1) for row in v], dim=-2)
+    vectors = torch.stack(v, dim=-1).movedim(0, -2)
     values, order = values.sort(dim=-1)
     vectors = vectors.gather(-1, order[..., None, :].expand_as(vectors))
     return values * safe.squeeze(-1), vectors
@@ -243,11 +243,14 @@ def _orthogonal(*rows: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, T
 
 def _rotate(
     a: list[list[Tensor]],
-    v: list[list[Tensor]],
+    v: list[Tensor],
     axes: tuple[int, int, int],
     root: Callable[[Tensor], Tensor],
 ) -> None:
-    """Zero the entry of the first two axes of matrices by one Jacobi rotation, in place."""
+    """Zero the entry of the first two axes of matrices by one Jacobi rotation, in place.
+
+    ``a`` are the entries ``(*)``, ``v`` the columns ``(3, *)`` of the eigenvectors.
+    """
     p, q, r = axes
     apq = a[p][q]
     active = apq != 0
@@ -263,10 +266,7 @@ def _rotate(
     a[r][p] = a[p][r] = c * arp - s * arq
     a[r][q] = a[q][r] = s * arp + c * arq
     a[p][q] = a[q][p] = torch.zeros_like(apq)
-    for i in range(3):
-        vip, viq = v[i][p], v[i][q]
-        v[i][p] = c * vip - s * viq
-        v[i][q] = s * vip + c * viq
+    v[p], v[q] = c * v[p] - s * v[q], s * v[p] + c * v[q]
 
 
 class PrincipalFrame(NamedTuple):

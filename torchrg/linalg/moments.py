@@ -255,10 +255,15 @@ class Segments:
         weights = (1 - ratio * ratio).clamp(min=0).square()
         return weights, medians, self.mean(residuals * residuals)
 
+    @cached_property
+    def have_points(self) -> bool:
+        """Whether each region has points."""
+        return bool(self.counts.all())
+
     def are_served(self, values: Tensor) -> bool:
         """Return whether kernels support float64 values of these regions."""
-        is_plain = values.device.type == "cpu" and values.dtype == torch.float64
-        return is_plain and kernels.serve() and bool(self.counts.all())
+        is_plain = values.is_cpu and values.dtype == torch.float64
+        return is_plain and kernels.serve() and self.have_points
 
     def median(self, values: Tensor) -> Tensor:
         """Return the lower median of the values of each region."""
@@ -424,8 +429,11 @@ def eigh3_lapack(matrices: Tensor) -> tuple[Tensor, Tensor]:
 
     Non-finite matrices give NaN.
     """
-    finite = matrices.isfinite().all(dim=(-2, -1))[..., None]
-    values, vectors = torch.linalg.eigh(torch.where(finite[..., None], matrices, 0.0), UPLO="U")
-    return torch.where(finite, values, torch.nan), torch.where(
-        finite[..., None], vectors, torch.nan
-    )
+    finite = matrices.isfinite()
+    if finite.all():
+        values, vectors = torch.linalg.eigh(matrices, UPLO="U")
+        return values, vectors
+    undefined = ~finite.all(dim=-1).all(dim=-1)
+    values, vectors = eigh3_lapack(matrices.masked_fill(undefined[..., None, None], 0.0))
+    values[undefined], vectors[undefined] = torch.nan, torch.nan
+    return values, vectors
