@@ -41,17 +41,22 @@ INLINE void load_points(Floats x, Floats y, Floats z, int n, int64_t m, int64_t 
   load_column(z, n, m, M, points.columns[2]);
 }
 
-// Sorts each lane by merge exchange (Knuth 5.2.2, algorithm M).
-void sort_lanes(Column& rows, int n) {
+// Sorts each lane into rows, which may be the values: merge exchange (Knuth 5.2.2, algorithm M).
+void sort_lanes(const Column& values, int n, Column& rows) {
+  for (int k = 0; k < n; k++) rows.set(k, values[k]);
   int top = 1;
   while (2 * top < n) top *= 2;
   for (int p = top; p > 0; p /= 2)
     for (int q = top, r = 0, d = p;; d = q - p, q /= 2, r = p) {
-      for (int from = r; from < n - d; from += 2 * p)
-        for (int i = from; i < smaller(from + p, n - d); i++) {
-          const Lanes a = rows[i], b = rows[i + d];
-          rows.set(i, smaller(a, b)), rows.set(i + d, larger(a, b));
-        }
+      const auto exchange = [&](int i) {
+        const Lanes a = rows[i], b = rows[i + d];
+        rows.set(i, smaller(a, b)), rows.set(i + d, larger(a, b));
+      };
+      if (p == 1)
+        for (int i = r; i < n - d; i += 2) exchange(i);
+      else
+        for (int from = r; from < n - d; from += 2 * p)
+          for (int i = from; i < smaller(from + p, n - d); i++) exchange(i);
       if (q == p) break;
     }
 }
@@ -207,15 +212,14 @@ SEPARATE Lanes majority_difference(const Column& rows, int n) {
   return result + all(0);
 }
 
-Lanes sort_and_scale(Column& rows, int n, double factor) {
-  sort_lanes(rows, n);
+Lanes sort_and_scale(const Column& values, int n, double factor, Column& rows) {
+  sort_lanes(values, n, rows);
   return majority_difference(rows, n) * float(factor);
 }
 
 // lanes.smallest_points.
 void mark_smallest(const Column& values, int n, int size, Column& marks) {
-  marks = values;
-  sort_lanes(marks, n);
+  sort_lanes(values, n, marks);
   const Lanes bound = marks[size - 1];
   Lanes room = all(size);
   for (int k = 0; k < n; k++) room -= one_where(values[k] < bound);
@@ -432,7 +436,7 @@ KERNEL lane_scales(int64_t n, int64_t M, Floats values, float* medians, float* d
   Column rows;
   for (int64_t m = 0; m < M; m += LANES) {
     load_column(values, int(n), m, M, rows);
-    sort_lanes(rows, int(n));
+    sort_lanes(rows, int(n), rows);
     store_row(medians, m, M, median_of_sorted(rows, int(n)));
     store_row(differences, m, M, majority_difference(rows, int(n)));
   }
@@ -487,9 +491,9 @@ KERNEL deterministic_sets(int64_t num_points, int64_t M, int64_t T, Floats x, Fl
       for (int j = i; j < 3; j++) {
         const Column &a = points.columns[i], &b = points.columns[j];
         for (int k = 0; k < n; k++) rows.set(k, a[k] + b[k]);
-        const Lanes sum = i == j ? all(2) : sort_and_scale(rows, n, factor);
+        const Lanes sum = i == j ? all(2) : sort_and_scale(rows, n, factor, rows);
         for (int k = 0; k < n; k++) rows.set(k, a[k] - b[k]);
-        const Lanes difference = i == j ? Lanes{} : sort_and_scale(rows, n, factor);
+        const Lanes difference = i == j ? Lanes{} : sort_and_scale(rows, n, factor, rows);
         scatters[5](i, j) = (sum * sum - difference * difference) / all(4);
       }
     Flags fails{};
@@ -501,8 +505,7 @@ KERNEL deterministic_sets(int64_t num_points, int64_t M, int64_t T, Floats x, Fl
         for (int k = 0; k < n; k++)
           norms.set(k, points.columns[0][k] * axes[0][d] + points.columns[1][k] * axes[1][d] +
                            points.columns[2][k] * axes[2][d]);
-        rows = norms;
-        const Lanes scale = sort_and_scale(rows, n, factor);
+        const Lanes scale = sort_and_scale(norms, n, factor, rows);
         fails = fails | ~(scale > 0);
         for (int k = 0; k < n; k++) {
           const Lanes value = norms[k] / scale;
@@ -514,8 +517,7 @@ KERNEL deterministic_sets(int64_t num_points, int64_t M, int64_t T, Floats x, Fl
       }
       for (int i = 0; i < 3; i++) {
         const Column& column = moved.columns[i];
-        rows = column;
-        sort_lanes(rows, n);
+        sort_lanes(column, n, rows);
         const Lanes center = median_of_sorted(rows, n);
         for (int k = 0; k < n; k++) {
           const Lanes away = column[k] - center;
@@ -620,9 +622,8 @@ KERNEL are_coplanar(int64_t num_points, int64_t num_rows, int64_t k, Floats poin
     const Lanes sq_radius = load(squares);
     Flags is_finite = sq_radius < all(INFINITE);
     for (int j = 0; j < k; j++) is_finite = is_finite & (residuals[j] < all(INFINITE));
-    sorted = residuals;
     const Lanes floor = all(float(floor_fraction)) * roots_of(sq_radius);
-    const Lanes scale = sort_and_scale(sorted, int(k), factor);
+    const Lanes scale = sort_and_scale(residuals, int(k), factor, sorted);
     const Lanes limit = median_of_sorted(sorted, int(k)) + all(2) * larger(scale, floor);
     for (int l = 0; l < used; l++) {
       open[rows[l]] = !is_finite[l];
