@@ -252,12 +252,11 @@ def _rotate(
     ``a`` are the entries ``(*)``, ``v`` the columns ``(3, *)`` of the eigenvectors.
     """
     p, q, r = axes
-    apq = a[p][q]
-    active = apq != 0
-    tau = (a[q][q] - a[p][p]) / (2 * torch.where(active, apq, 1.0))
-    # tau may overflow to infinity for a negligible apq; then t is correctly 0.
-    t = torch.where(tau >= 0, 1.0, -1.0).to(tau.dtype) / (tau.abs() + root(1 + tau * tau))
-    t = torch.where(active, t, 0.0)
+    apq, zero = a[p][q], torch.zeros_like(a[p][q])
+    # tau may overflow to infinity for a negligible apq, and is infinite or NaN for a zero.
+    tau = (a[q][q] - a[p][p]) / (2 * apq)
+    t = 1 / (tau.abs() + root(1 + tau * tau))
+    t = torch.where(apq != 0, torch.where(tau >= 0, t, -t), zero)
     c = 1 / root(1 + t * t)
     s = t * c
     a[p][p] = a[p][p] - t * apq
@@ -265,7 +264,7 @@ def _rotate(
     arp, arq = a[r][p], a[r][q]
     a[r][p] = a[p][r] = c * arp - s * arq
     a[r][q] = a[q][r] = s * arp + c * arq
-    a[p][q] = a[q][p] = torch.zeros_like(apq)
+    a[p][q] = a[q][p] = zero
     v[p], v[q] = c * v[p] - s * v[q], s * v[p] + c * v[q]
 
 

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from torchrg import kernels
+from torchrg.linalg.moments import eigh3_lapack
 from torchrg.robust.lanes import (
     covariance_entries,
-    eigenvectors,
     is_in_kernels,
     sum_products,
     sum_squares,
@@ -128,7 +128,7 @@ def refine_flat(columns: list[Tensor], chosen: Tensor, tolerance: Tensor, dimens
     weights = chosen.double()
     count = sum_points(weights)
     means = [sum_points(weights * column) / count for column in columns]
-    vectors = eigenvectors(covariance_entries(columns, means, weights, count))
+    _, vectors = eigh3_lapack(covariance_entries(columns, means, weights, count))
     centered = [column - mean for column, mean in zip(columns, means, strict=True)]
     normals = vectors[..., : len(columns) - dimension].unbind(dim=2)
     across = sum_squares([sum_products(centered, normal.unbind(dim=1)) for normal in normals])

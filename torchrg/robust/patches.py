@@ -177,7 +177,9 @@ def fit_patchwise(
             f"{num_points}: too few to trust the covariance{repair}."
         )
     dense = patches.detach().reshape(batch.numel(), num_points, size)
-    counted = torch.isfinite(dense).all(dim=-1)
+    counted = torch.ones_like(dense[..., 0], dtype=torch.bool)
+    if not dense.sum().isfinite():
+        counted = dense.isfinite().all(dim=-1)
     if mask is not None:
         counted &= mask.reshape(-1, num_points)
 
