@@ -25,7 +25,7 @@ MAX_NEIGHBORS = 512
 """Maximum number of values per row, ``MAX_WIDTH`` in ``plain.h``. Longer rows use the torch
 definitions."""
 SIGNATURES = {
-    "majority_differences": "f[nk] l[n]? -> f[n]",
+    "majority_differences": "f[nk] l[n] -> f[n]",
     "may_have_flats": "f[KM] f[KM] f[KM] l[4S] f[M] -> b[M]",
     "lane_scales": "f[KM] -> f[M] f[M]",
     "smallest_points": "f[KM] n -> f[KM]",

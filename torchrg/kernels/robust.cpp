@@ -366,17 +366,18 @@ struct Job {
 
 }  // namespace
 
-// torchrg.robust.scale._majority_difference of the first `counts` values of sorted rows, or of all;
-// NaN where a difference is not finite. Eight rows with equal counts share the lanes.
+// torchrg.robust.scale._majority_difference of the first `counts` values of sorted rows; NaN where
+// a difference is not finite. Eight rows with equal counts share the lanes.
 KERNEL majority_differences(int64_t num_rows, int64_t n, Floats rows, Longs counts, float* found) {
-  if (n < 2 || n > MAX_WIDTH) return TOO_WIDE;
+  if (n < 1 || n > MAX_WIDTH) return TOO_WIDE;
   Column lanes;
-  for (int64_t i = 0; i < num_rows; i++) found[i] = 0;
-  for (int64_t count = counts ? 2 : n; count <= n; count++) {
-    int64_t chosen[LANES];
+  int64_t chosen[LANES], low = n, high = 0;
+  for (int64_t i = 0; i < num_rows; i++)
+    found[i] = 0, low = smaller(low, counts[i]), high = larger(high, counts[i]);
+  for (int64_t count = larger(low, int64_t(2)); count <= smaller(high, n); count++) {
     int used = 0;
     for (int64_t i = 0; i < num_rows; i++) {
-      if (!counts || counts[i] == count) chosen[used++] = i;
+      if (counts[i] == count) chosen[used++] = i;
       if (used == 0 || (used < LANES && i + 1 < num_rows)) continue;
       for (int l = 0; l < LANES; l++)
         for (int k = 0; k < count; k++) lanes.at(k, l) = rows[chosen[l < used ? l : 0] * n + k];

@@ -429,11 +429,10 @@ def eigh3_lapack(matrices: Tensor) -> tuple[Tensor, Tensor]:
 
     Non-finite matrices give NaN.
     """
-    finite = matrices.isfinite()
-    if finite.all():
-        values, vectors = torch.linalg.eigh(matrices, UPLO="U")
-        return values, vectors
-    undefined = ~finite.all(dim=-1).all(dim=-1)
-    values, vectors = eigh3_lapack(matrices.masked_fill(undefined[..., None, None], 0.0))
-    values[undefined], vectors[undefined] = torch.nan, torch.nan
+    undefined = ~matrices.isfinite().flatten(-2).all(dim=-1)
+    if are_undefined := bool(undefined.any()):
+        matrices = matrices.masked_fill(undefined[..., None, None], 0.0)
+    values, vectors = torch.linalg.eigh(matrices, UPLO="U")
+    if are_undefined:
+        values[undefined], vectors[undefined] = torch.nan, torch.nan
     return values, vectors

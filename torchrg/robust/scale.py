@@ -158,15 +158,13 @@ def scale_of_rows(
     shape, n = rows.shape[:-1], rows.shape[-1]
     if n == 0:
         return rows.new_full(shape, torch.nan)
-    rows, counts = rows.reshape(shape.numel(), n).contiguous(), None
+    rows = rows.reshape(shape.numel(), n).contiguous()
     if mask is not None:
         # Masked-out values become +inf and sort last, before NaN.
-        counted = mask.reshape(shape.numel(), n)
-        rows, counts = torch.where(counted, rows, torch.inf), counted.sum(dim=1)
-    ascending = sort_rows(rows)
-    undefined = ascending[:, -1].isnan()
-    if counts is not None:
-        undefined |= counts == 0
+        mask = mask.reshape(rows.shape)
+        rows = torch.where(mask, rows, torch.inf)
+    counts, ascending = _count_values(rows, mask), sort_rows(rows)
+    undefined = ascending[:, -1].isnan() | (counts == 0)
     ascending = torch.where(undefined[:, None], 0.0, ascending)
     scales: dict[Scale, Callable[[], Tensor]] = {
         "median": lambda: median_of_sorted(ascending, counts),
@@ -175,6 +173,11 @@ def scale_of_rows(
         "tau": lambda: tau_of_sorted(ascending, counts),
     }
     return torch.where(undefined, torch.nan, scales[name]()).reshape(shape)
+
+
+def _count_values(rows: Tensor, mask: Tensor | None) -> Tensor:
+    """Return the number of values of each row ``(B, n)`` in a mask, by default all."""
+    return (torch.ones_like(rows, dtype=torch.bool) if mask is None else mask).sum(dim=1)
 
 
 def sort_rows(rows: Tensor) -> Tensor:
@@ -212,7 +215,7 @@ def tau_of_sorted(rows: Tensor, counts: Tensor | None = None) -> Tensor:
         _median_deviation(rows, counts),
         median_of_sorted(rows, counts),
     )
-    counts = torch.full_like(middle, n, dtype=torch.int64) if counts is None else counts
+    counts = _count_values(rows, None) if counts is None else counts
     counted = torch.arange(n, device=rows.device)[:, None] < counts
     unit = torch.where(spread > 0, spread, 1.0)
     standard = (torch.where(counted, rows.t(), middle) - middle) / unit
@@ -248,13 +251,9 @@ def sum_points(values: Tensor) -> Tensor:
 
 def qn_of_sorted(rows: Tensor, counts: Tensor | None = None, *, finite_sample: bool) -> Tensor:
     """Qn of each sorted row of ``(B, n)``, shape ``(B,)``."""
-    n = rows.shape[1]
-    if n < 2:
-        return rows.new_zeros(len(rows))
-    differences = _majority_difference(rows, counts)
-    if finite_sample and counts is not None:
-        return rows.new_tensor([qn_factor(count) for count in range(n + 1)])[counts] * differences
-    return (qn_factor(n) if finite_sample else QN_FACTOR) * differences
+    counts = _count_values(rows, None) if counts is None else counts
+    factors = [qn_factor(n) if finite_sample else QN_FACTOR for n in range(rows.shape[1] + 1)]
+    return rows.new_tensor(factors)[counts] * _majority_difference(rows, counts)
 
 
 def qn_factor(n: int) -> float:
@@ -278,7 +277,7 @@ def half_size(n: int) -> int:
     return n // 2 + 1
 
 
-def _majority_difference(sorted_rows: Tensor, counts: Tensor | None) -> Tensor:
+def _majority_difference(sorted_rows: Tensor, counts: Tensor) -> Tensor:
     """Return the C(h, 2)-th smallest pairwise difference of each sorted row; NaN with a NaN.
 
     Two values at least h ranks apart enclose at least C(h + 1, 2) pairs that are no farther apart.
@@ -290,27 +289,23 @@ def _majority_difference(sorted_rows: Tensor, counts: Tensor | None) -> Tensor:
     if kernels.serve(sorted_rows, k=sorted_rows.shape[1]):
 
         def find(rows: slice) -> Tensor:
-            counted = None if counts is None else counts[rows]
-            return kernels.call("majority_differences", sorted_rows[rows], counted)[0]
+            return kernels.call("majority_differences", sorted_rows[rows], counts[rows])[0]
 
         parts = map_chunks(find, len(sorted_rows), ROWS_AT_ONCE, sorted_rows.device)
         differences = torch.cat(parts)
         infinite = differences.isnan().nonzero().squeeze(1)
         if len(infinite):
-            counted = None if counts is None else counts[infinite]
-            differences[infinite] = _find_difference(sorted_rows[infinite], counted)
+            differences[infinite] = _find_difference(sorted_rows[infinite], counts[infinite])
         return differences
     return _find_difference(sorted_rows, counts)
 
 
-def _find_difference(sorted_rows: Tensor, counts: Tensor | None = None) -> Tensor:
+def _find_difference(sorted_rows: Tensor, counts: Tensor) -> Tensor:
     """Implement :func:`_majority_difference` for all values and devices."""
-    if counts is None:
-        is_long = sorted_rows.shape[1] > _MAX_LISTED_VALUES
-        return (_difference_by_counts if is_long else _difference_by_lags)(sorted_rows)
     found = sorted_rows.new_zeros(len(sorted_rows))
     for count in set(counts.tolist()) - {0, 1}:
-        found[counts == count] = _find_difference(sorted_rows[counts == count, :count])
+        find = _difference_by_counts if count > _MAX_LISTED_VALUES else _difference_by_lags
+        found[counts == count] = find(sorted_rows[counts == count, :count])
     return found
 
 
