@@ -195,14 +195,10 @@ def is_concrete(*tensors: Tensor | None) -> bool:
     if torch.compiler.is_compiling() or is_jit_traced():
         return False
     try:
-        for tensor in tensors:
-            if tensor is not None and tensor.layout is torch.strided:
-                tensor.data_ptr()
-                if tensor.is_meta:
-                    return False
+        strided = [t for t in tensors if t is not None and t.layout is torch.strided]
+        return all(tensor.data_ptr() >= 0 and not tensor.is_meta for tensor in strided)
     except RuntimeError:  # A tensor wrapper without storage.
         return False
-    return True
 
 
 def raise_forward_mode(caller: str) -> NoReturn:

@@ -98,8 +98,8 @@ _DTYPES = {
     "b": torch.bool,
 }
 """Dtypes by their letters in a signature."""
-_NUMBERS: dict[str, type[int] | type[float]] = {"n": int, "x": float}
-"""Types of numbers by their letters in a signature."""
+_NUMBERS: dict[str, Any] = {"n": (int, ctypes.c_int64), "x": (float, ctypes.c_double)}
+"""Types of numbers in Python and C by their letters in a signature."""
 _SERVED = torch.float32, torch.int32, torch.bool
 """Dtypes of the tensors that kernels process."""
 _FIXED = {str(length): length for length in range(10)}
@@ -170,7 +170,8 @@ class _Argument:
 
     def __init__(self, word: str) -> None:
         self.word, self.axes = word, word[1:].strip("[]?")
-        self.dtype, self.number = _DTYPES.get(word[0].lower()), _NUMBERS.get(word[0])
+        self.dtype = _DTYPES.get(word[0].lower())
+        self.number, self.type = _NUMBERS.get(word[0], (None, ctypes.c_void_p))
         self.is_optional, self.is_written = word.endswith("?"), word[0].isupper()
         self.new_empty = torch.empty(0, dtype=self.dtype, device="cpu").new_empty
 
@@ -197,9 +198,7 @@ def _types(name: str) -> list[Any]:
     """Return the types of the arguments of a kernel in C: the lengths of axes come first."""
     inputs, outputs = _signature(name)
     lengths = {axis for kind in inputs for axis in kind.axes if axis not in _FIXED}
-    numbers: dict[Any, Any] = {int: ctypes.c_int64, float: ctypes.c_double}
-    kinds = [numbers.get(kind.number, ctypes.c_void_p) for kind in inputs + outputs]
-    return [ctypes.c_int64] * len(lengths) + kinds
+    return [ctypes.c_int64] * len(lengths) + [kind.type for kind in inputs + outputs]
 
 
 def _kind() -> str:

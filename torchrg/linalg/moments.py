@@ -255,15 +255,10 @@ class Segments:
         weights = (1 - ratio * ratio).clamp(min=0).square()
         return weights, medians, self.mean(residuals * residuals)
 
-    @cached_property
-    def have_points(self) -> bool:
-        """Whether each region has points."""
-        return bool(self.counts.all())
-
     def are_served(self, values: Tensor) -> bool:
         """Return whether kernels support float64 values of these regions."""
         is_plain = values.is_cpu and values.dtype == torch.float64
-        return is_plain and kernels.serve() and self.have_points
+        return is_plain and kernels.serve() and bool(self.counts.all())
 
     def median(self, values: Tensor) -> Tensor:
         """Return the lower median of the values of each region."""

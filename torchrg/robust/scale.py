@@ -286,6 +286,7 @@ def _majority_difference(sorted_rows: Tensor, counts: Tensor) -> Tensor:
     if sorted_rows.requires_grad:
         difference = _majority_difference(sorted_rows.detach(), counts)
         return _difference_of_pair(sorted_rows, difference)
+    differences = torch.full_like(sorted_rows[:, 0], torch.nan).masked_fill_(counts < 2, 0.0)
     if kernels.serve(sorted_rows, k=sorted_rows.shape[1]):
 
         def find(rows: slice) -> Tensor:
@@ -293,20 +294,12 @@ def _majority_difference(sorted_rows: Tensor, counts: Tensor) -> Tensor:
 
         parts = map_chunks(find, len(sorted_rows), ROWS_AT_ONCE, sorted_rows.device)
         differences = torch.cat(parts)
-        infinite = differences.isnan().nonzero().squeeze(1)
-        if len(infinite):
-            differences[infinite] = _find_difference(sorted_rows[infinite], counts[infinite])
-        return differences
-    return _find_difference(sorted_rows, counts)
-
-
-def _find_difference(sorted_rows: Tensor, counts: Tensor) -> Tensor:
-    """Implement :func:`_majority_difference` for all values and devices."""
-    found = sorted_rows.new_zeros(len(sorted_rows))
-    for count in set(counts.tolist()) - {0, 1}:
-        find = _difference_by_counts if count > _MAX_LISTED_VALUES else _difference_by_lags
-        found[counts == count] = find(sorted_rows[counts == count, :count])
-    return found
+    undefined = differences.isnan()
+    for count in set(counts[undefined].tolist()):
+        rows = undefined & (counts == count)
+        select = _difference_by_counts if count > _MAX_LISTED_VALUES else _difference_by_lags
+        differences[rows] = select(sorted_rows[rows, :count])
+    return differences
 
 
 def _difference_by_counts(sorted_rows: Tensor) -> Tensor:
