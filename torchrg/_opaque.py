@@ -233,11 +233,9 @@ class _Gradient(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> Any:  # noqa: ANN401
         raise NotImplementedError(f"{ctx.name}: has no second derivatives under torch.func.")
 
+    jvp = backward
+
     @staticmethod
     def vmap(info: Any, in_dims: Any, call: str, *tensors: Tensor) -> Any:  # noqa: ANN401
         first = _with_batch_first(info.batch_size, in_dims[1:], list(tensors))
         return _Gradient.apply(call, *first), 0  # type: ignore[no-untyped-call]
-
-    @staticmethod
-    def jvp(ctx: Any, *tangents: Any) -> Any:  # noqa: ANN401
-        raise NotImplementedError(f"{ctx.name}: has no second derivatives under torch.func.")

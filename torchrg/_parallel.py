@@ -97,14 +97,11 @@ def map_tasks(
 
     Every task writes different rows, so the result does not depend on the number of threads.
     """
-    if device.type != "cpu":
-        return [work(task) for task in tasks]
-    _retain_freed_memory()
-    if _THREADS.get() is None:
+    if device.type == "cpu" and _THREADS.get() is None:
         with sequential_operations():
             return map_tasks(work, tasks, device)
     num_threads = min(allowed_threads(), len(tasks))
-    if num_threads < 2:
+    if num_threads < 2 or device.type != "cpu":
         return [work(task) for task in tasks]
     results, waiting = {}, iter(list(enumerate(tasks)))
     grad_enabled, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
@@ -150,6 +147,7 @@ def sequential_operations() -> Iterator[None]:
     if _THREADS.get() is not None:
         yield
         return
+    _retain_freed_memory()
     token, pool_token = _THREADS.set(torch.get_num_threads()), _POOL.set([])
     before = _set_thread_counts([1] * (1 + len(_openmp_libraries())))
     try:

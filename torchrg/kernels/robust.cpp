@@ -54,9 +54,8 @@ void sort_lanes(const Column& values, int n, Column& rows) {
       };
       if (p == 1)
         for (int i = r; i < n - d; i += 2) exchange(i);
-      else
-        for (int from = r; from < n - d; from += 2 * p)
-          for (int i = from; i < smaller(from + p, n - d); i++) exchange(i);
+      for (int from = r; p > 1 && from < n - d; from += 2 * p)
+        for (int i = from; i < smaller(from + p, n - d); i++) exchange(i);
       if (q == p) break;
     }
 }

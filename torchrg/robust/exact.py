@@ -50,8 +50,7 @@ def find_flats(columns: list[Tensor], tolerance: Tensor, size: int) -> tuple[Ten
     )
     lanes = torch.nonzero(candidates).squeeze(1)
     if len(lanes):
-        lane_columns = take_lanes(columns, lanes)
-        found = _find_flats(lane_columns, tolerance[lanes], size, simplices)
+        found = _find_flats(take_lanes(columns, lanes), tolerance[lanes], size, simplices)
         dimension[lanes], members[:, lanes] = found
     return dimension, members
 

@@ -26,7 +26,7 @@ from torchrg.robust.lanes import (
 from torchrg.robust.patches import RobustFit, fit_patchwise, patchwise
 from torchrg.robust.scale import half_size, sum_points
 from torchrg.robust.starts import Starts, initial_sets
-from torchrg.robust.weights import chi2_quantile
+from torchrg.robust.weights import chi2_quantile, within_quantile
 
 Target = Literal["shape", "location"]
 """Estimate to which the efficiency of 95 % at the normal distribution refers."""
@@ -192,7 +192,6 @@ def _estimate(
     size = len(columns)
     sq_scale = scale * scale
     distances = final.distances / sq_scale
-    bound = distances.new_tensor([chi2_quantile(quantile, size)])
 
     def scatter(shape: _Shape) -> Tensor:
         denominator = _volume(shape.ellipsoid) / sq_scale
@@ -201,7 +200,7 @@ def _estimate(
     return RobustFit(
         location=torch.stack(final.ellipsoid.means, dim=-1),
         covariance=scatter(final),
-        support=(distances <= bound).t(),
+        support=(within_quantile(distances, quantile, size) > 0).t(),
         sq_distances=distances.t(),
         raw_location=torch.stack(raw.ellipsoid.means, dim=-1),
         raw_covariance=scatter(raw),

@@ -79,8 +79,7 @@ def _centers_and_scales(column: Tensor) -> tuple[Tensor, Tensor]:
     scale = qn_factor(len(column)) * difference
     lanes = torch.nonzero(~(scale > 0)).squeeze(1)
     if len(lanes):
-        (unscaled,) = take_lanes([column], lanes)
-        scale[lanes] = _positive_scale(sorted_points(unscaled), center[lanes])
+        scale[lanes] = _positive_scale(sorted_points(column[:, lanes]), center[lanes])
     return center, scale
 
 
