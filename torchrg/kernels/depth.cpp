@@ -9,6 +9,7 @@ typedef const double* Doubles;
 
 constexpr int REACH = 2, SIDE = 5, NUM_SIZES = 4, MOMENTS = 10, COLUMNS = 9;
 constexpr int TILE = 64, WIDE = TILE + 2 * REACH;  // columns fitted together
+constexpr int BROAD = 640;                         // columns described together
 constexpr int LONG = 9, SHORT = 3;                 // sides of narrow windows in pixels
 constexpr double FLAT = 1.35, SELF_REACH = 3.5, SAME_NOISE = 2, MIN_QUARTERS = 0.7;
 constexpr double BEND = 0.005, MAX_BEND = 0.03, STEEPEST = 4;
@@ -358,17 +359,14 @@ KERNEL choose_narrow(int64_t h, int64_t w, int64_t n, Doubles values, Doubles u,
 namespace {
 
 // Properties shared by all pixels of a window.
-struct Described {
-  int64_t number = -1;
-  Window window = {};
-  double slopes[2] = {}, origin = 0, deviation = 0, limit = 0, length = 1, normal[3] = {};
-  double variances[2] = {};  // of the columns and rows of its pixels
+struct Surface {
+  Window window;
+  double slopes[2], origin, deviation, limit, length, normal[3];
+  double variances[2];  // of the columns and rows of its pixels
 
-  INLINE_MEMBER void look_at(const Windows& all, int64_t window_number, const double* focal) {
-    if (number == window_number) return;
-    number = window_number, window = all[number], origin = window[ORIGIN];
-    deviation = window[DEVIATION], limit = window[TOLERANCE];
-    slopes[0] = window[U_SLOPE], slopes[1] = window[V_SLOPE];
+  INLINE_MEMBER void look_at(const Window& seen, const double* focal) {
+    window = seen, origin = window[ORIGIN], deviation = window[DEVIATION];
+    limit = window[TOLERANCE], slopes[0] = window[U_SLOPE], slopes[1] = window[V_SLOPE];
     variances[0] = (window.columns * window.columns - 1) / 12;
     variances[1] = (window.rows * window.rows - 1) / 12;
     const double a = slopes[0] * focal[0], b = slopes[1] * focal[1];
@@ -378,6 +376,20 @@ struct Described {
   INLINE_MEMBER double tolerance(double noise) const {
     return deviation > FLAT * limit ? deviation : larger(limit, noise);
   }
+};
+
+// The surfaces of adjacent pixels of a row, one for each run of pixels with one window.
+struct Surfaces {
+  Surface runs[BROAD + 1];
+  uint16_t run[BROAD + 1];
+
+  INLINE_MEMBER void read(const Windows& all, Longs numbers, int count, const double* focal) {
+    for (int j = 0, k = -1; j < count; j++) {
+      if (j == 0 || numbers[j] != numbers[j - 1]) runs[++k].look_at(all[numbers[j]], focal);
+      run[j] = uint16_t(k);
+    }
+  }
+  INLINE_MEMBER const Surface& operator[](int j) const { return runs[run[j]]; }
 };
 
 }  // namespace
@@ -398,11 +410,9 @@ KERNEL describe_pixels(int64_t h, int64_t w, int64_t N, int64_t M, int64_t n, Do
     if (!all.has(windows[pixel])) return NO_SUCH_ROW;
   const Noise expected = {factor, constant, growth, rounding};
   const double focal[2] = {fx, fy};
-  Described here, next, below;  // neighboring pixels usually have the same window
-  const auto are_joined = [&](int64_t r, int64_t c, Described& other, bool is_down) {
+  const auto are_joined = [&](int64_t r, int64_t c, const Surface& here, const Surface& other,
+                              bool is_down) {
     const int64_t there = r * w + c + (is_down ? w : 1);
-    if (windows[there] == here.number) return true;
-    other.look_at(all, windows[there], focal);
     const double u_slope = here.slopes[0] - other.slopes[0],
                  v_slope = here.slopes[1] - other.slopes[1];
     const double step = u_slope * u[c] + v_slope * v[r] + here.origin - other.origin;
@@ -416,23 +426,31 @@ KERNEL describe_pixels(int64_t h, int64_t w, int64_t N, int64_t M, int64_t n, Do
     const double turned =
         square(b[0] - a[0] * sign) + square(b[1] - a[1] * sign) + square(b[2] - a[2] * sign);
     if (turned <= max_sq_chord) return true;
-    const bool similar = u_slope * u_slope + v_slope * v_slope <=
-                         sq_slope_noise(here.window, ours) + sq_slope_noise(other.window, theirs);
-    return (similar || turned <= wider_sq_chord) && here.window.holds(r + is_down, c + !is_down) &&
-           other.window.holds(r, c);
+    const auto are_similar = [&]() {
+      return u_slope * u_slope + v_slope * v_slope <=
+             sq_slope_noise(here.window, ours) + sq_slope_noise(other.window, theirs);
+    };
+    return (turned <= wider_sq_chord || are_similar()) &&
+           here.window.holds(r + is_down, c + !is_down) && other.window.holds(r, c);
   };
-  alignas(32) double parts[6][TILE];  // of the windows of pixels, for one pass without branches
-  for (int64_t r = from; r < to; r++)
-    for (int64_t left = 0; left < w; left += TILE) {
-      const int width = int(smaller(int64_t(TILE), w - left));
-      for (int64_t pixel = r * w + left; pixel < r * w + left + width; pixel++)
-        noise[pixel] = expected.at(values[pixel]);
+  alignas(32) double parts[6][BROAD];  // of the windows of pixels, for one pass without branches
+  Surfaces rows[2];
+  for (int64_t left = 0; left < w; left += BROAD) {
+    const int width = int(smaller(int64_t(BROAD), w - left));
+    const int count = width + (left + width < w);
+    for (int64_t r = from; r < to; r++) {
+      const int64_t first = r * w + left;
+      Surfaces &row = rows[r % 2], &below = rows[(r + 1) % 2];
+      if (r == from) row.read(all, windows + first, count, focal);
+      if (r + 1 < h) below.read(all, windows + first + w, count, focal);
+      for (int j = 0; j < width; j++) noise[first + j] = expected.at(values[first + j]);
       for (int j = 0; j < width; j++) {
-        const int64_t c = left + j, pixel = r * w + c;
-        if (windows[pixel] == next.number) here = next;
-        here.look_at(all, windows[pixel], focal);
-        right[pixel] = flat[pixel] && c + 1 < w && flat[pixel + 1] && are_joined(r, c, next, false);
-        down[pixel] = flat[pixel] && r + 1 < h && flat[pixel + w] && are_joined(r, c, below, true);
+        const int64_t c = left + j, pixel = first + j, number = windows[pixel];
+        const Surface& here = row[j];
+        right[pixel] = flat[pixel] && c + 1 < w && flat[pixel + 1] &&
+                       (windows[pixel + 1] == number || are_joined(r, c, here, row[j + 1], false));
+        down[pixel] = flat[pixel] && r + 1 < h && flat[pixel + w] &&
+                      (windows[pixel + w] == number || are_joined(r, c, here, below[j], true));
         valid[pixel] = flat[pixel] || (seen[pixel] && here.deviation < NONE);
         for (int axis = 0; axis < 3; axis++)
           normals[3 * pixel + axis] = valid[pixel] ? here.normal[axis] : 0;
@@ -441,7 +459,7 @@ KERNEL describe_pixels(int64_t h, int64_t w, int64_t N, int64_t M, int64_t n, Do
         parts[4][j] = valid[pixel] ? here.deviation : 0, parts[5][j] = here.length;
       }
       for (int j = 0; j < width; j++) {
-        const int64_t c = left + j, pixel = r * w + c;
+        const int64_t c = left + j, pixel = first + j;
         const double z = 1 / (values[pixel] > 0 ? values[pixel] : 1);
         const double ray = x[c] * x[c] + y[r] * y[r] + 1;
         const double across = square(z * parts[4][j] / parts[5][j]);
@@ -453,6 +471,7 @@ KERNEL describe_pixels(int64_t h, int64_t w, int64_t N, int64_t M, int64_t n, Do
         curvature[pixel] = smaller(across / (total > 0 ? total : 1), 1.0 / 3);
       }
     }
+  }
   return DONE;
 }
 
