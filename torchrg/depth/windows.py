@@ -12,8 +12,9 @@ from torch import Tensor
 
 from torchrg._parallel import nonzero_rows
 from torchrg.depth.passes import has_kernels, pass_over_rows
-from torchrg.linalg.moments import kth_smallest
+from torchrg.linalg.moments import Segments, kth_smallest
 from torchrg.linalg.precision import machine_epsilon
+from torchrg.neighbors.order import sort_integers
 
 CELL_SIZES = (8, 4, 2, 1)
 """Cell widths in pixels, largest first."""
@@ -245,7 +246,8 @@ def noise_by_size(
     noises, factor = {}, 0.0
     for size, (deviation, mean) in windows.items():
         ratios = torch.maximum(deviation, rounding * mean) / shape.evaluate(mean)
-        typical = float(_low_quantile(ratios)) if len(ratios) else factor
+        rank = int(_FLAT_QUANTILE * (len(ratios) - 1))
+        typical = float(kth_smallest(ratios, rank)) if len(ratios) else factor
         factor = typical if factor == 0 else min(max(typical, factor), _MAX_GROWTH * factor)
         noises[size] = shape._replace(factor=factor)
     return noises
@@ -271,27 +273,37 @@ def find_jitter(table: Tensor, size: int) -> float:
     contains windows of one size.
     """
     u_slope, v_slope, deviation = _sample_windows(table, size, "u_slope", "v_slope", "deviation")
-    slope, order = torch.hypot(u_slope, v_slope).sort()
-    is_steep = slope > 0
-    ratio = deviation[order][is_steep] / slope[is_steep]
-    steep = ratio.tensor_split(_NUM_BINS)[_NUM_BINS // 2 :]
-    return min([_MAX_JITTER, *(float(_low_quantile(ratios)) for ratios in steep if len(ratios))])
+    slope = torch.hypot(u_slope, v_slope)
+    steep = nonzero_rows(slope > 0)
+    if len(steep) == 0:
+        return _MAX_JITTER
+    _, ratios = _quantiles_by_bin(slope[steep], deviation[steep] / slope[steep])
+    return min([_MAX_JITTER, *ratios[_NUM_BINS // 2 :].tolist()])
 
 
-def _low_quantile(values: Tensor) -> Tensor:
-    """Return the quantile of values reached by flat windows."""
-    return kth_smallest(values, int(_FLAT_QUANTILE * (len(values) - 1)))
+def _quantiles_by_bin(keys: Tensor, values: Tensor) -> tuple[list[Tensor], Tensor]:
+    """Split positive keys ``(n,)`` into twelve ascending bins of about equal size.
+
+    Returns the bins that are not empty, and for each the quantile of its values that flat windows
+    reach.
+    """
+    if has_kernels(keys):
+        # The bits of positive numbers are in the order of the numbers.
+        rows, bits = sort_integers(keys.view(torch.int64))
+        keys = bits.view(keys.dtype)
+    else:
+        keys, rows = keys.sort(stable=True)
+    bins = [part for part in keys.tensor_split(_NUM_BINS) if len(part)]
+    counts = torch.tensor([len(part) for part in bins], device=keys.device)
+    return bins, Segments(torch.repeat_interleave(counts)).quantile(values[rows], _FLAT_QUANTILE)
 
 
 def _fit_noise(columns: Sequence[Tensor], rounding: float) -> tuple[float, float]:
     """Fit nonnegative ``b + a w^2`` to deviations at means ``(n,)`` of windows; return a and b."""
     if len(columns[0]) == 0:
         return 0.0, 0.0
-    mean, order = columns[1].sort()
-    deviation = torch.maximum(columns[0][order], rounding * mean)
-    num_bins = min(_NUM_BINS, len(mean))
-    x = torch.stack([part.square().mean() for part in mean.tensor_split(num_bins)])
-    q = torch.stack([_low_quantile(part) for part in deviation.tensor_split(num_bins)])
+    bins, q = _quantiles_by_bin(columns[1], torch.maximum(columns[0], rounding * columns[1]))
+    x = torch.stack([part.square().mean() for part in bins])
     # Relative errors: a bin with only cluttered windows has little weight.
     p, e = x / q, 1 / q
     spread = (p * p).sum() * (e * e).sum() - (p * e).sum() ** 2
