@@ -8,9 +8,9 @@ namespace {
 typedef const double* Doubles;
 
 constexpr int REACH = 2, SIDE = 5, NUM_SIZES = 4, MOMENTS = 10, COLUMNS = 9;
-constexpr int TILE = 64, WIDE = TILE + 2 * REACH;  // columns fitted together
-constexpr int BROAD = 640;                         // columns described together
-constexpr int LONG = 9, SHORT = 3;                 // sides of narrow windows in pixels
+constexpr int TILE = 128, WIDE = TILE + 2 * REACH;  // columns fitted together
+constexpr int BROAD = 640;                          // columns described together
+constexpr int LONG = 9, SHORT = 3;                  // sides of narrow windows in pixels
 constexpr double FLAT = 1.35, SELF_REACH = 3.5, SAME_NOISE = 2, MIN_QUARTERS = 0.7;
 constexpr double BEND = 0.005, MAX_BEND = 0.03, STEEPEST = 4;
 constexpr double NONE = __builtin_inf();
@@ -40,46 +40,41 @@ INLINE void solve(const double (&s)[MOMENTS][N], int j, double min_count, double
   to[3][j] = has_plane & (variance < NONE) ? square_root(variance) : NONE, to[4][j] = w;
 }
 
-// Contribution of a pixel to the sums of its windows, at index j.
-template <int N>
-INLINE void write_moments(uint8_t seen, double u, double v, double value, double (*to)[N], int j) {
-  const double one = seen, mu = one * u, mv = one * v, w = one > 0 ? value : 0;
-  to[0][j] = one, to[1][j] = mu, to[2][j] = mv, to[3][j] = w, to[4][j] = mu * u;
-  to[5][j] = mu * v, to[6][j] = mv * v, to[7][j] = w * u, to[8][j] = w * v, to[9][j] = w * w;
+// Contribution of a pixel to the sums of its windows; `value` is 0 unless it counts one.
+INLINE void find_moments(double one, double u, double v, double value, double (&to)[MOMENTS]) {
+  const double mu = one * u, mv = one * v;
+  to[0] = one, to[1] = mu, to[2] = mv, to[3] = value, to[4] = mu * u, to[5] = mu * v;
+  to[6] = mv * v, to[7] = value * u, to[8] = value * v, to[9] = value * value;
 }
 
-// Fits planes (5, h, w) to the windows around cells; `read` returns the column sums of a row. Also
-// sums cells to cells of twice the width.
-template <class Read>
-int64_t fit_all(int64_t h, int64_t w, int64_t from, int64_t to, double min_count, double min_spread,
-                double* planes, double* coarse, Read read) {
-  alignas(32) double ring[SIDE][MOMENTS][WIDE], down[WIDE], sums[MOMENTS][TILE], solved[5][TILE];
+// Fits planes (5, h, w) to the windows around cells, and sums these to cells of twice the width.
+// `read` prepares a row of the columns of a tile, `add` adds the moments of such rows.
+template <class Read, class Add>
+INLINE int64_t fit_all(int64_t h, int64_t w, int64_t from, int64_t to, double min_count,
+                       double min_spread, double* planes, double* coarse, Read read, Add add) {
+  alignas(32) double down[MOMENTS][WIDE], sums[MOMENTS][TILE], solved[5][TILE];
   const int64_t coarse_w = (w + 1) / 2, coarse_size = (h + 1) / 2 * coarse_w;
   for (int64_t left = 0; left < w; left += TILE) {
     const int width = int(smaller(int64_t(TILE), w - left));
     for (int64_t row = from - REACH; row < to + REACH; row++) {
-      auto& newest = ring[(row + SIDE) % SIDE];
-      __builtin_memset(newest, 0, sizeof newest);
-      const int64_t first = larger(left - REACH, int64_t(0)),
-                    last = smaller(left + width + REACH, w);
-      if (row >= 0 && row < h)
-        read(row, first, int(last - first), newest, int(first - left) + REACH);
+      read(row, left);
       const int64_t i = row - REACH;
       if (i < from) continue;
-      const auto &middle = ring[(i + 5) % SIDE], &above = ring[(i + 4) % SIDE],
-                 &below = ring[(i + 1) % SIDE], &top = ring[(i + 3) % SIDE],
-                 &bottom = ring[(i + 2) % SIDE];
-      for (int m = 0; m < MOMENTS; m++) {
-        for (int j = 0; j < WIDE; j++)
-          down[j] = middle[m][j] + above[m][j] + below[m][j] + top[m][j] + bottom[m][j];
-        for (int j = 0; j < TILE; j++)
-          sums[m][j] = down[j + 2] + down[j + 1] + down[j + 3] + down[j] + down[j + 4];
-        for (int j = 0; i % 2 == 0 && j < width; j += 2) {
-          const double *one = middle[m] + j + REACH, *other = below[m] + j + REACH;
-          coarse[m * coarse_size + i / 2 * coarse_w + (left + j) / 2] =
-              (one[0] + other[0]) + (left + j + 1 < w ? one[1] + other[1] : 0);
+      if (i % 2 == 0) {
+        const int64_t rows[] = {i, i + 1};
+        add(rows, left, down);
+        for (int m = 0; m < MOMENTS; m++) {
+          double* cells = coarse + m * coarse_size + i / 2 * coarse_w + left / 2;
+          for (int j = 0; j < (width + 1) / 2; j++)
+            cells[j] = down[m][2 * j + REACH] + down[m][2 * j + 1 + REACH];
         }
       }
+      const int64_t rows[] = {i, i - 1, i + 1, i - 2, i + 2};
+      add(rows, left, down);
+      for (int m = 0; m < MOMENTS; m++)
+        for (int j = 0; j < TILE; j++)
+          sums[m][j] =
+              down[m][j + 2] + down[m][j + 1] + down[m][j + 3] + down[m][j] + down[m][j + 4];
       for (int j = 0; j < TILE; j++) solve(sums, j, min_count, min_spread, solved);
       for (int part = 0; part < 5; part++)
         __builtin_memcpy(planes + (part * h + i) * w + left, solved[part], width * sizeof(double));
@@ -154,14 +149,32 @@ KERNEL fit_pixel_windows(int64_t h, int64_t w, int64_t m, int64_t p, int64_t q, 
                          double min_count, double min_spread, int64_t from, int64_t to) {
   if (m != MOMENTS || p != (h + 1) / 2 || q != (w + 1) / 2 || !are_rows_of(from, to, h))
     return TOO_WIDE;
-  const auto* ones = reinterpret_cast<const uint8_t*>(seen);
-  return fit_all(h, w, from, to, min_count, min_spread, planes, coarse,
-                 [&](int64_t row, int64_t first, int count, double (*sums)[WIDE], int at) {
-                   for (int j = 0; j < count; j++) {
-                     const int64_t pixel = row * w + first + j;
-                     write_moments(ones[pixel], u[first + j], v[row], values[pixel], sums, at + j);
-                   }
-                 });
+  alignas(32) double ones[SIDE][WIDE], weighted[SIDE][WIDE], across[WIDE], along[SIDE];
+  return fit_all(
+      h, w, from, to, min_count, min_spread, planes, coarse,
+      [&](int64_t row, int64_t left) {
+        auto &one = ones[(row + SIDE) % SIDE], &value = weighted[(row + SIDE) % SIDE];
+        const bool is_inside = row >= 0 && row < h;
+        along[(row + SIDE) % SIDE] = is_inside ? v[row] : 0;
+        for (int k = 0; k < WIDE; k++) {
+          const int64_t c = left + k - REACH;
+          const bool counts = is_inside && c >= 0 && c < w && seen[row * w + c];
+          one[k] = counts, value[k] = counts ? values[row * w + c] : 0;
+          across[k] = c >= 0 && c < w ? u[c] : 0;
+        }
+      },
+      [&](const auto& rows, int64_t, double (&down)[MOMENTS][WIDE]) {
+        constexpr int COUNT = sizeof rows / sizeof *rows;
+        for (int k = 0; k < WIDE; k++) {
+          double total[MOMENTS], terms[MOMENTS];
+          for (int t = 0; t < COUNT; t++) {
+            const int at = int((rows[t] + SIDE) % SIDE);
+            find_moments(ones[at][k], across[k], along[at], weighted[at][k], terms);
+            for (int m = 0; m < MOMENTS; m++) total[m] = t ? total[m] + terms[m] : terms[m];
+          }
+          for (int m = 0; m < MOMENTS; m++) down[m][k] = total[m];
+        }
+      });
 }
 
 // windows.fit_windows around larger cells.
@@ -170,12 +183,25 @@ KERNEL fit_cell_windows(int64_t m, int64_t h, int64_t w, int64_t p, int64_t q, D
                         int64_t from, int64_t to) {
   if (m != MOMENTS || p != (h + 1) / 2 || q != (w + 1) / 2 || !are_rows_of(from, to, h))
     return TOO_WIDE;
-  return fit_all(h, w, from, to, min_count, min_spread, planes, coarse,
-                 [&](int64_t row, int64_t first, int count, double (*sums)[WIDE], int at) {
-                   for (int k = 0; k < MOMENTS; k++)
-                     __builtin_memcpy(sums[k] + at, cells + (k * h + row) * w + first,
-                                      count * sizeof(double));
-                 });
+  return fit_all(
+      h, w, from, to, min_count, min_spread, planes, coarse, [](int64_t, int64_t) {},
+      [&](const auto& rows, int64_t left, double (&down)[MOMENTS][WIDE]) {
+        static const double none[WIDE] = {};
+        constexpr int COUNT = sizeof rows / sizeof *rows;
+        const int64_t first = larger(left - REACH, int64_t(0)), last = smaller(left + TILE + REACH, w);
+        const int count = int(last - first), at = int(first - left) + REACH;
+        for (int m = 0; m < MOMENTS; m++) {
+          const double* lines[COUNT];
+          for (int t = 0; t < COUNT; t++)
+            lines[t] = rows[t] < 0 || rows[t] >= h ? none : cells + (m * h + rows[t]) * w + first;
+          if (count < WIDE) __builtin_memset(down[m], 0, sizeof down[m]);
+          for (int k = 0; k < count; k++) {
+            double total = lines[0][k];
+            for (int t = 1; t < COUNT; t++) total += lines[t][k];
+            down[m][at + k] = total;
+          }
+        }
+      });
 }
 
 // normals.rate_windows: maximum deviations of windows, and whether windows or quarters exceed
@@ -304,12 +330,12 @@ KERNEL fit_narrow_windows(int64_t h, int64_t w, int64_t n, Doubles values, Doubl
   if (!are_rows_of(from, to, n)) return TOO_WIDE;
   for (int64_t number = from; number < to; number++) {
     if (pixels[number] < 0 || pixels[number] >= h * w) return NO_SUCH_ROW;
-    double sums[MOMENTS][2] = {}, terms[MOMENTS][1], solved[5][2];
+    double sums[MOMENTS][2] = {}, terms[MOMENTS], solved[5][2];
     for (int shape = 0; shape < 2; shape++) {
       visit_narrow(h, w, pixels[number], shape, [&](int64_t r, int64_t c) {
         if (numbers[r * w + c] < 0) return;
-        write_moments(1, u[c], v[r], values[r * w + c], terms, 0);
-        for (int m = 0; m < MOMENTS; m++) sums[m][shape] += terms[m][0];
+        find_moments(1, u[c], v[r], values[r * w + c], terms);
+        for (int m = 0; m < MOMENTS; m++) sums[m][shape] += terms[m];
       });
       solve(sums, shape, min_count, min_spread, solved);
       for (int part = 0; part < 5; part++)
