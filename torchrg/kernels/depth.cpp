@@ -501,26 +501,29 @@ KERNEL describe_pixels(int64_t h, int64_t w, int64_t N, int64_t M, int64_t n, Do
   return DONE;
 }
 
-// growth.connect_pixels: the first pixel of the connected component of each pixel.
+// growth.connect_pixels: the number of the connected component of each pixel.
 KERNEL connect_pixels(int64_t h, int64_t w, Flagged flat, Flagged right, Flagged down,
                       int64_t* roots) {
   const auto root_of = [&](int64_t pixel) {
     while (roots[pixel] != pixel) pixel = roots[pixel] = roots[roots[pixel]];
     return pixel;
   };
+  int64_t root = -1;  // of the pixel before
   for (int64_t r = 0; r < h; r++)
     for (int64_t c = 0; c < w; c++) {
-      const int64_t pixel = r * w + c;
-      roots[pixel] = flat[pixel] ? pixel : -1;
+      const int64_t pixel = r * w + c, above = pixel - w;
+      roots[pixel] = -1;
       if (!flat[pixel]) continue;
-      if (c > 0 && flat[pixel - 1] && right[pixel - 1]) roots[pixel] = root_of(pixel - 1);
-      if (r > 0 && flat[pixel - w] && down[pixel - w]) {
-        const int64_t one = root_of(pixel), other = root_of(pixel - w);
-        roots[larger(one, other)] = smaller(one, other);
+      if (!(c > 0 && flat[pixel - 1] && right[pixel - 1])) root = pixel;
+      roots[pixel] = root;
+      if (r > 0 && flat[above] && down[above] && roots[above] != root) {
+        const int64_t other = root_of(above), larger_root = larger(root, other);
+        root = smaller(root, other), roots[larger_root] = roots[pixel] = root;
       }
     }
+  int64_t count = 0;
   for (int64_t pixel = 0; pixel < h * w; pixel++)
-    if (flat[pixel]) roots[pixel] = roots[roots[pixel]];
+    if (flat[pixel]) roots[pixel] = roots[pixel] == pixel ? count++ : roots[roots[pixel]];
   return DONE;
 }
 
