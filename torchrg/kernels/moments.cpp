@@ -8,6 +8,7 @@ namespace {
 typedef const double* Doubles;
 
 constexpr int BLOCK = 128;
+constexpr int AHEAD = 64;  // pixels that are loaded early
 
 // Sums the T terms of `count` points from index `from` on; `term` writes the terms of one point.
 template <int T, class Term>
@@ -272,7 +273,8 @@ KERNEL fit_pixel_regions(int64_t h, int64_t w, int64_t n, int64_t num, Doubles v
   double *u = buffers, *v = u + n, *z = v + n, *weights = z + n;
   return visit_regions(n, num, counts, [&](int64_t m, int64_t start, int64_t end) {
     for (int64_t i = start, first = 0, row = 0; i < end; i++) {
-      const int64_t pixel = rows[i];
+      const int64_t pixel = rows[i], later = rows[smaller(i + AHEAD, n - 1)];
+      __builtin_prefetch(values + later), __builtin_prefetch(noise + later);
       if (pixel < first || pixel >= first + w) row = pixel / w, first = row * w;
       u[i] = x[pixel - first], v[i] = y[row], z[i] = values[pixel], weights[i] = 1;
     }
