@@ -108,7 +108,7 @@ def _segment(
     if config.max_depth is not None:
         depth = torch.where(depth <= config.max_depth, depth, 0.0)
     seen = depth > 0
-    inverse = torch.where(seen, 1 / depth.double(), 0.0)
+    inverse = depth.double().reciprocal().nan_to_num_(posinf=0.0)
     fx, fy, cx, cy = (float(intrinsics[index]) for index in ((0, 0), (1, 1), (0, 2), (1, 2)))
     u = torch.arange(depth.shape[1], device=depth.device).double() - cx
     v = torch.arange(depth.shape[0], device=depth.device).double() - cy
