@@ -50,7 +50,7 @@ def boundaries(labels: Tensor, steps: Iterable[tuple[int, int]]) -> tuple[Tensor
         step = down * width + right
         here = nonzero_rows(flat[: max(len(flat) - step, 0)] != flat[step:])
         column = here % width + right
-        here = here[(column >= 0) & (column < width)]
+        here = here[nonzero_rows((column >= 0) & (column < width))]
         pairs.append(torch.stack([here, here + step]))
     first, second = torch.cat(pairs, dim=1)
     return first, second
@@ -98,18 +98,18 @@ def _strip_contacts(
     num_regions, image = len(count), labels.view(noise.shape)
     pitch = [float((index[-1] - index[0]) / max(len(index) - 1, 1)) for index in (x, y)]
     here, there = boundaries(image, [(1, 0), (0, 1)])
-    pairs = torch.stack([labels[here], labels[there]], dim=1)
+    pairs = torch.stack([labels.index_select(0, pixels) for pixels in (here, there)])
     sides = torch.cat([pairs.flatten(), image[0], image[-1], image[:, 0], image[:, -1]])
     width = 2 * count.double() / torch.bincount(sides + 1, minlength=num_regions + 1)[1:]
-    meets = (pairs >= 0).all(dim=1)
-    here, (one, two) = here[meets], pairs[meets].T
+    meets = nonzero_rows((pairs[0] >= 0) & (pairs[1] >= 0))
+    here, (one, two) = here[meets], pairs[:, meets]
     a, b, c = (planes[one] - planes[two]).unbind(dim=1)
     gap = (a * x[here % len(x)] + b * y[here // len(x)] + c).abs()
     gap -= _MAX_NOISE * noise.flatten()[here]
     slope = ((a * pitch[0]).square() + (b * pitch[1]).square()).sqrt()
     reach = (width / 2).clamp(min=_MIN_REACH)
     keys = [
-        (strip * num_regions + face)[gap <= slope * reach[strip]]
+        (strip * num_regions + face)[nonzero_rows(gap <= slope * reach[strip])]
         for strip, face in ((one, two), (two, one))
     ]
     pair, contacts = torch.unique(torch.cat(keys), return_counts=True)
