@@ -69,7 +69,8 @@ def convert_depth(
         check_floating(caller, depth=stored)
     exact = depth_scale == 1 and stored.is_floating_point()
     values = stored if exact else stored.double() / depth_scale
-    meters = torch.where(has_depth(stored), values, 0.0)
+    seen = has_depth(stored)
+    meters = torch.where(seen, values, 0.0)
     if depth_kind == "ray" and intrinsics is not None:
         from kornia.geometry.depth import depth_to_3d_v2
 
@@ -77,7 +78,7 @@ def convert_depth(
         cameras = intrinsics.to(images).reshape(-1, 3, 3)
         points = depth_to_3d_v2(images, cameras, normalize_points=True)
         meters = points[..., 2].reshape(meters.shape)
-    valid = nonzero_rows(meters > 0)
+    valid = nonzero_rows(seen)
     sample = meters.flatten()[valid[:: len(valid) // _SAMPLED + 1]]
     median = float(sample.median()) if len(sample) else 1.0
     if not _MIN_MEDIAN_DEPTH <= median <= _MAX_MEDIAN_DEPTH:

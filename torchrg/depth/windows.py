@@ -4,6 +4,7 @@ Windows are squares of 5 by 5 cells, and a cell is 1, 2, 4 or 8 pixels wide. Win
 apart, so that all large ones together cost less than the smallest.
 """
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
@@ -91,10 +92,9 @@ def fit_windows(image: Image) -> dict[int, Tensor]:
     the plane fields filled in; they are contiguous in memory.
     """
     values, seen, u, v = image
-    shapes, columns = [seen.shape], len(Windows._fields)
-    for _ in CELL_SIZES[1:]:
-        shapes.append(torch.Size(-(-length // 2) for length in shapes[-1]))
-    parts = [columns * shape.numel() for shape in shapes]
+    columns = len(Windows._fields)
+    shapes = [[-(-length // size) for length in seen.shape] for size in sorted(CELL_SIZES)]
+    parts = [columns * math.prod(shape) for shape in shapes]
     flat = torch.split(values.new_empty(sum(parts)), parts)
     tables = {
         size: part.view(columns, *shape)
@@ -261,7 +261,7 @@ def _sample_windows(table: Tensor, size: int, *names: str) -> list[Tensor]:
     step = max(_SAMPLE_STRIDE // size, 1)
     windows = Windows(*table[:, ::step, ::step])
     valid = nonzero_rows(windows.deviation < torch.inf)
-    return [getattr(windows, name).flatten()[valid] for name in names]
+    return [getattr(windows, name).flatten().index_select(0, valid) for name in names]
 
 
 def find_jitter(table: Tensor, size: int) -> float:
@@ -275,8 +275,6 @@ def find_jitter(table: Tensor, size: int) -> float:
     u_slope, v_slope, deviation = _sample_windows(table, size, "u_slope", "v_slope", "deviation")
     slope = torch.hypot(u_slope, v_slope)
     steep = nonzero_rows(slope > 0)
-    if len(steep) == 0:
-        return _MAX_JITTER
     _, ratios = _quantiles_by_bin(slope[steep], deviation[steep] / slope[steep])
     return min([_MAX_JITTER, *ratios[_NUM_BINS // 2 :].tolist()])
 
@@ -294,7 +292,7 @@ def _quantiles_by_bin(keys: Tensor, values: Tensor) -> tuple[list[Tensor], Tenso
     else:
         keys, rows = keys.sort(stable=True)
     bins = [part for part in keys.tensor_split(_NUM_BINS) if len(part)]
-    counts = torch.tensor([len(part) for part in bins], device=keys.device)
+    counts = torch.tensor([len(part) for part in bins], dtype=torch.int64, device=keys.device)
     return bins, Segments(torch.repeat_interleave(counts)).quantile(values[rows], _FLAT_QUANTILE)
 
 
