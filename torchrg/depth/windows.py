@@ -276,7 +276,7 @@ def find_jitter(table: Tensor, size: int) -> float:
     slope = torch.hypot(u_slope, v_slope)
     steep = nonzero_rows(slope > 0)
     _, ratios = _quantiles_by_bin(slope[steep], deviation[steep] / slope[steep])
-    return min([_MAX_JITTER, *ratios[_NUM_BINS // 2 :].tolist()])
+    return min([_MAX_JITTER, *map(float, ratios[_NUM_BINS // 2 :])])
 
 
 def _quantiles_by_bin(keys: Tensor, values: Tensor) -> tuple[list[Tensor], Tensor]:

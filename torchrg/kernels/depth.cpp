@@ -188,8 +188,9 @@ KERNEL fit_cell_windows(int64_t m, int64_t h, int64_t w, int64_t p, int64_t q, D
       [&](const auto& rows, int64_t left, double (&down)[MOMENTS][WIDE]) {
         static const double none[WIDE] = {};
         constexpr int COUNT = sizeof rows / sizeof *rows;
-        const int64_t first = larger(left - REACH, int64_t(0)), last = smaller(left + TILE + REACH, w);
-        const int count = int(last - first), at = int(first - left) + REACH;
+        const int64_t first = larger(left - REACH, int64_t(0));
+        const int count = int(smaller(left + TILE + REACH, w) - first),
+                  at = int(first - left) + REACH;
         for (int m = 0; m < MOMENTS; m++) {
           const double* lines[COUNT];
           for (int t = 0; t < COUNT; t++)
@@ -452,12 +453,10 @@ KERNEL describe_pixels(int64_t h, int64_t w, int64_t N, int64_t M, int64_t n, Do
     const double turned =
         square(b[0] - a[0] * sign) + square(b[1] - a[1] * sign) + square(b[2] - a[2] * sign);
     if (turned <= max_sq_chord) return true;
-    const auto are_similar = [&]() {
-      return u_slope * u_slope + v_slope * v_slope <=
-             sq_slope_noise(here.window, ours) + sq_slope_noise(other.window, theirs);
-    };
-    return (turned <= wider_sq_chord || are_similar()) &&
-           here.window.holds(r + is_down, c + !is_down) && other.window.holds(r, c);
+    return here.window.holds(r + is_down, c + !is_down) && other.window.holds(r, c) &&
+           (turned <= wider_sq_chord ||
+            u_slope * u_slope + v_slope * v_slope <=
+                sq_slope_noise(here.window, ours) + sq_slope_noise(other.window, theirs));
   };
   alignas(32) double parts[6][BROAD];  // of the windows of pixels, for one pass without branches
   Surfaces rows[2];
@@ -583,25 +582,18 @@ struct Front {
 // and diagonals.
 template <class Visit>
 INLINE void visit_borders(int64_t h, int64_t w, Longs labels, const Visit& visit) {
-  constexpr int64_t BLOCK = 32;
   const auto compare = [&](int64_t i, int64_t other) {
     if (labels[i] != labels[other]) visit(i, other);
   };
   for (int64_t r = 0; r < h; r++)
-    for (int64_t left = 0; left < w; left += BLOCK) {
-      const int64_t right = smaller(left + BLOCK, w);
-      if (r + 1 < h && right < w) {
-        const int64_t *here = labels + r * w, *below = here + w;
-        int64_t changes = 0;
-        for (int64_t c = left; c < left + BLOCK; c++)
-          changes |= (here[c] ^ here[c + 1]) | (here[c] ^ below[c]) | (here[c] ^ below[c + 1]);
-        if (!changes) continue;
-      }
-      for (int64_t c = left, i = r * w + left; c < right; c++, i++) {
-        if (c + 1 < w) compare(i, i + 1);
-        if (r + 1 < h) compare(i, i + w);
-        if (r + 1 < h && c + 1 < w) compare(i, i + w + 1), compare(i + 1, i + w);
-      }
+    for (int64_t c = 0, i = r * w; c < w; c++, i++) {
+      const bool is_inside = r + 1 < h && c + 1 < w;
+      if (is_inside && !((labels[i] ^ labels[i + 1]) | (labels[i] ^ labels[i + w]) |
+                         (labels[i] ^ labels[i + w + 1])))
+        continue;
+      if (c + 1 < w) compare(i, i + 1);
+      if (r + 1 < h) compare(i, i + w);
+      if (is_inside) compare(i, i + w + 1), compare(i + 1, i + w);
     }
 }
 
