@@ -242,16 +242,9 @@ constexpr int WIDE = 2;
 typedef double Wide __attribute__((vector_size(8 * WIDE)));
 typedef float Narrow __attribute__((vector_size(4 * WIDE)));
 typedef int64_t WideFlags __attribute__((vector_size(8 * WIDE)));
-INLINE Wide larger(Wide a, Wide b) { return a < b ? b : a; }
-INLINE Wide size_of(Wide a) { return a < 0 ? -a : a; }
 INLINE Wide square_root(Wide a) {
   for (int i = 0; i < WIDE; i++) a[i] = square_root(a[i]);
   return a;
-}
-INLINE bool is_any(WideFlags flags) {
-  int64_t any = 0;
-  for (int i = 0; i < WIDE; i++) any |= flags[i];
-  return any != 0;
 }
 
 // torchrg.linalg.smallest_eigenvector3, bit-identical, of some lanes.
@@ -261,7 +254,7 @@ struct Eigenvectors {
 
   INLINE_MEMBER void start(const Wide (&covariances)[6]) {
     Wide scale{};
-    for (const Wide& entry : covariances) scale = larger(scale, size_of(entry));
+    for (const Wide& entry : covariances) scale = larger(scale, magnitude(entry));
     safe = scale > 0 ? scale : Wide{} + 1;
     xx = covariances[0] / safe, xy = covariances[1] / safe, xz = covariances[2] / safe;
     yy = covariances[3] / safe, yz = covariances[4] / safe, zz = covariances[5] / safe;
@@ -275,7 +268,7 @@ struct Eigenvectors {
     constexpr double CONVERGED = 1e-9;
     const Wide value = ((root - trace) * root + minors) * root - determinant;
     const Wide slope = (3 * root - 2 * trace) * root + minors;
-    const Wide step = value / slope, size = size_of(step);
+    const Wide step = value / slope, size = magnitude(step);
     const WideFlags can_move = moves & (size < double(INFINITE));
     root = can_move ? root - step : root;
     if (may_stop) moves = can_move & (size > CONVERGED * trace);
@@ -287,15 +280,9 @@ struct Eigenvectors {
     const Wide a = y * z - yz * yz, b = x * z - xz * xz, c = x * y - xy * xy;
     const Wide ab = xz * yz - xy * z, ac = xy * yz - xz * y, bc = xy * xz - x * yz;
     const WideFlags is_second = b > a, is_third = c > larger(a, b);
-    Wide u = is_third    ? ac
-             : is_second ? ab
-                         : a,
-         v = is_third    ? bc
-             : is_second ? b
-                         : ab,
-         w = is_third    ? c
-             : is_second ? bc
-                         : ac;
+    Wide u = where(is_third, ac, where(is_second, ab, a));
+    Wide v = where(is_third, bc, where(is_second, b, ab));
+    Wide w = where(is_third, c, where(is_second, bc, ac));
     const Wide length = square_root(u * u + v * v + w * w);
     u /= length, v /= length, w /= length;
     const WideFlags is_line = larger(larger(a, b), c) < NEARLY_EQUAL;

@@ -11,6 +11,7 @@
 
 // Input arrays.
 typedef const float* Floats;
+typedef const double* Doubles;
 typedef const int32_t* Ints;
 typedef const int64_t* Longs;
 typedef const bool* Flagged;
@@ -38,39 +39,33 @@ struct Pair {
   INLINE_MEMBER Pair(T value) : low(Four{} + value), high(Four{} + value) {}
   INLINE_MEMBER Pair(Four a, Four b) : low(a), high(b) {}
   INLINE_MEMBER T operator[](int lane) const { return lane < 4 ? low[lane] : high[lane - 4]; }
+  INLINE_MEMBER Pair operator-() const { return {-low, -high}; }
+  INLINE_MEMBER Pair operator~() const { return {~low, ~high}; }
+
+#define ON_BOTH(Result, operation)                                 \
+  friend INLINE_MEMBER Result operator operation(Pair a, Pair b) { \
+    return {a.low operation b.low, a.high operation b.high};       \
+  }
+#define ON_BOTH_ASSIGN(operation) \
+  ON_BOTH(Pair, operation)        \
+  friend INLINE_MEMBER Pair& operator operation## = (Pair & a, Pair b) { return a = a operation b; }
+  typedef Pair<int32_t, FourFlags> Truth;
+  ON_BOTH_ASSIGN(+)
+  ON_BOTH_ASSIGN(-)
+  ON_BOTH_ASSIGN(*)
+  ON_BOTH_ASSIGN(/)
+  ON_BOTH_ASSIGN(&)
+  ON_BOTH_ASSIGN(|)
+  ON_BOTH(Pair, ^)
+  ON_BOTH(Pair, >>)
+  ON_BOTH(Truth, <)
+  ON_BOTH(Truth, <=)
+  ON_BOTH(Truth, >)
+  ON_BOTH(Truth, >=)
+  ON_BOTH(Truth, ==)
 };
 typedef Pair<float, FourFloats> Lanes;
 typedef Pair<int32_t, FourFlags> Flags;
-
-#define ON_BOTH(Result, operation, Operand)                        \
-  INLINE Result operator operation(Operand a, Operand b) {         \
-    return Result(a.low operation b.low, a.high operation b.high); \
-  }
-#define ON_BOTH_ASSIGN(operation, Operand) \
-  ON_BOTH(Operand, operation, Operand)     \
-  INLINE Operand& operator operation## = (Operand & a, Operand b) { return a = a operation b; }
-ON_BOTH_ASSIGN(+, Lanes)
-ON_BOTH_ASSIGN(-, Lanes)
-ON_BOTH_ASSIGN(*, Lanes)
-ON_BOTH_ASSIGN(/, Lanes)
-ON_BOTH_ASSIGN(+, Flags)
-ON_BOTH_ASSIGN(-, Flags)
-ON_BOTH(Flags, &, Flags)
-ON_BOTH(Flags, ^, Flags)
-ON_BOTH(Flags, |, Flags)
-ON_BOTH(Flags, >>, Flags)
-ON_BOTH(Flags, <, Lanes)
-ON_BOTH(Flags, <=, Lanes)
-ON_BOTH(Flags, >, Lanes)
-ON_BOTH(Flags, >=, Lanes)
-ON_BOTH(Flags, ==, Lanes)
-ON_BOTH(Flags, <, Flags)
-ON_BOTH(Flags, <=, Flags)
-ON_BOTH(Flags, >, Flags)
-ON_BOTH(Flags, >=, Flags)
-ON_BOTH(Flags, ==, Flags)
-INLINE Lanes operator-(Lanes a) { return Lanes(-a.low, -a.high); }
-INLINE Flags operator~(Flags a) { return Flags(~a.low, ~a.high); }
 #endif
 
 INLINE float square_root(float value) { return __builtin_sqrtf(value); }
@@ -79,65 +74,68 @@ INLINE float size_of(float value) { return __builtin_fabsf(value); }
 INLINE double size_of(double value) { return __builtin_fabs(value); }
 INLINE bool is_finite(double value) { return __builtin_isfinite(value); }
 
+// Copies bytes.
+template <class To>
+INLINE To read_as(const void* bytes) {
+  To found;
+  __builtin_memcpy((void*)&found, bytes, sizeof found);
+  return found;
+}
+INLINE Lanes load(const float* values) { return read_as<Lanes>(values); }
+INLINE Flags load(const int32_t* values) { return read_as<Flags>(values); }
+INLINE void store(int32_t* values, Flags lanes) { __builtin_memcpy(values, &lanes, sizeof lanes); }
+INLINE void store(float* values, Lanes lanes) { __builtin_memcpy(values, &lanes, sizeof lanes); }
+
+// Numbers, or lanes of them.
+template <class Flag, class T>
+INLINE T where(Flag flags, T a, T b) {
+  return flags ? a : b;
+}
+#ifdef __AVX__
+INLINE Lanes to_float(Flags a) { return __builtin_convertvector(a, Lanes); }
+#else
+template <class T, class Four>
+INLINE Pair<T, Four> where(Flags flags, Pair<T, Four> a, Pair<T, Four> b) {
+  return {flags.low ? a.low : b.low, flags.high ? a.high : b.high};
+}
+INLINE Lanes to_float(Flags a) {
+  return {__builtin_convertvector(a.low, FourFloats), __builtin_convertvector(a.high, FourFloats)};
+}
+#endif
 template <class T>
 INLINE T larger(T a, T b) {
-  return a < b ? b : a;
+  return where(a < b, b, a);
 }
 template <class T>
 INLINE T smaller(T a, T b) {
-  return b < a ? b : a;
+  return where(b < a, b, a);
 }
-
-INLINE Lanes load(const float* values) {
-  Lanes lanes;
-  __builtin_memcpy((void*)&lanes, values, sizeof lanes);
-  return lanes;
+template <class T>
+INLINE T magnitude(T a) {
+  return where(a < 0, -a, a);
 }
-INLINE Flags load(const int32_t* values) {
-  Flags lanes;
-  __builtin_memcpy((void*)&lanes, values, sizeof lanes);
-  return lanes;
-}
-INLINE void store(int32_t* values, Flags lanes) { __builtin_memcpy(values, &lanes, sizeof lanes); }
-INLINE void store(float* values, Lanes lanes) { __builtin_memcpy(values, &lanes, sizeof lanes); }
 INLINE Lanes all(float value) { return Lanes{} + value; }
-#ifdef __AVX__
-INLINE Lanes to_float(Flags a) { return __builtin_convertvector(a, Lanes); }
-INLINE Lanes where(Flags flags, Lanes a, Lanes b) { return flags ? a : b; }
-INLINE Flags where(Flags flags, Flags a, Flags b) { return flags ? a : b; }
-#else
-INLINE Lanes to_float(Flags a) {
-  return Lanes(__builtin_convertvector(a.low, FourFloats),
-               __builtin_convertvector(a.high, FourFloats));
-}
-INLINE Lanes where(Flags flags, Lanes a, Lanes b) {
-  return Lanes(flags.low ? a.low : b.low, flags.high ? a.high : b.high);
-}
-INLINE Flags where(Flags flags, Flags a, Flags b) {
-  return Flags(flags.low ? a.low : b.low, flags.high ? a.high : b.high);
-}
-#endif
-INLINE Lanes magnitude(Lanes a) { return where(a < 0, -a, a); }
 INLINE Lanes positive(Lanes a) { return where(a > 0, a, all(0)); }
-INLINE Lanes larger(Lanes a, Lanes b) { return where(a < b, b, a); }
-INLINE Lanes smaller(Lanes a, Lanes b) { return where(b < a, b, a); }
-INLINE Flags larger(Flags a, Flags b) { return where(a < b, b, a); }
-INLINE Flags smaller(Flags a, Flags b) { return where(b < a, b, a); }
-
-INLINE int total(Flags a) {
-  return ((a[0] + a[4]) + (a[2] + a[6])) + ((a[1] + a[5]) + (a[3] + a[7]));
-}
+INLINE Lanes or_one(Lanes a) { return where(a > 0, a, all(1)); }
 INLINE Lanes one_where(Flags flags) { return where(flags, all(1), all(0)); }
+INLINE Lanes side_where(Flags flags) { return where(flags, all(1), all(-1)); }
+
 // Whether a lane is negative, such as true.
+template <class Vector>
+INLINE bool is_any(Vector flags) {
+  auto any = flags[0];
+  for (int lane = 1; lane < int(sizeof flags / sizeof any); lane++) any |= flags[lane];
+  return any < 0;
+}
+#ifdef __SSE__
 INLINE bool is_any(Flags flags) {
 #ifdef __AVX__
   return __builtin_ia32_movmskps256((Lanes)flags) != 0;
-#elif defined(__SSE__)
-  return __builtin_ia32_movmskps((FourFloats)(flags.low | flags.high)) != 0;
 #else
-  return total(flags >> 31) != 0;
+  return __builtin_ia32_movmskps((FourFloats)(flags.low | flags.high)) != 0;
 #endif
 }
+#endif
 INLINE Lanes roots_of(Lanes squares) {
   float lanes[LANES];
   store(lanes, squares);
@@ -146,12 +144,16 @@ INLINE Lanes roots_of(Lanes squares) {
 }
 INLINE int padded(int count) { return (count + LANES - 1) / LANES * LANES; }
 
-// Whether all numbers are valid rows in [0, num_rows).
-INLINE bool is_row(int32_t number, int64_t num_rows) {
-  return (number >= 0) & (int64_t(number) < num_rows);
+// Whether a number is a row.
+INLINE bool is_row(int64_t number, int64_t num_rows) {
+  return uint64_t(number) < uint64_t(num_rows);
 }
-INLINE bool are_rows(const int32_t* numbers, int64_t count, int64_t num_rows) {
-  uint32_t highest = 0;
-  for (int64_t j = 0; j < count; j++) highest = larger(highest, uint32_t(numbers[j]));
-  return count < 1 || (highest <= uint32_t(INT32_MAX) && int64_t(highest) < num_rows);
+// Whether all numbers are.
+template <class T>
+INLINE bool are_rows(const T* numbers, int64_t count, int64_t num_rows) {
+  const int64_t most = sizeof(T) == 4 ? INT32_MAX : INT64_MAX, last = smaller(num_rows - 1, most);
+  T wrong = 0;  // in its sign, without a branch
+  for (int64_t j = 0; j < count; j++)
+    wrong |= numbers[j] | T(uint64_t(last) - uint64_t(numbers[j]));
+  return wrong >= 0;
 }

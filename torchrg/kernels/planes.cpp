@@ -150,7 +150,7 @@ INLINE Flags select(int32_t* keys, int k, Flags ranks) {
     const Flags is_high = missing >= 0;
     low = where(is_high, low, smaller(middle + 1, high)), high = where(is_high, middle, high);
   }
-  while (total(low < high)) {
+  while (is_any(low < high)) {
     const Flags middle = middle_of(low, high);
     Flags missing = num_above, below = low, above = high;
     for (int j = 0; j < k; j++) {
