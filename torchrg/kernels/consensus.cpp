@@ -21,37 +21,27 @@ struct Meeting {
   Lanes deviation;
 };
 INLINE Meeting choose(Flags flags, const Meeting& a, const Meeting& b) {
-  return {where(flags, a.planes, b.planes), where(flags, a.deviation, b.deviation)};
+  return {choose(flags, a.planes, b.planes), where(flags, a.deviation, b.deviation)};
 }
-
-INLINE Lanes sum(const Column& values, int width) {
-  Lanes sums{};  // of 0 and 1, in any order
-  for (int j = 0; j < width; j++) sums += values[j];
-  return sums;
-}
-
-INLINE Lanes side(Lanes sum) { return where(sum >= 0, all(1), all(-1)); }
 
 // hypotheses._refit
 void refit(const Patch& patch, const Column& weights, Lanes reach, bool bisquare, Planes& planes) {
-  static thread_local Column storage;
-  Column& voted_weights = storage;
+  Column voted_weights;
   for (int j = 0; j < patch.width; j++) {
     const Lanes residual = planes.residuals(patch, j) / reach;
     Lanes near = positive(1 - residual * residual);
     if (bisquare) near *= near;
     voted_weights.set(j, weights[j] * near);
   }
-  const Planes fitted = fit_planes(patch, voted_weights, patch.width);
-  planes = where(fitted.middle > 1e-6f * fitted.high, fitted, planes);
+  const Fits fitted = fit_planes(patch, voted_weights, patch.width);
+  planes = choose(fitted.middle > 1e-6f * fitted.high, fitted, planes);
 }
 
 // hypotheses.vote_planes
 Planes vote(const Patch& patch, const Column& counted, Lanes noise, const Planes& start,
             const Pairs& pairs, const Constants& constants) {
-  static thread_local Column storage[2];
-  Column &weights = storage[0], &nearness = storage[1];
-  const Lanes maximum = farthest(patch, counted), far = where(maximum > 0, maximum, all(1));
+  Column weights, nearness;
+  const Lanes far = or_one(farthest(patch, counted));
   for (int j = 0; j < patch.width; j++) {
     const Lanes near = patch.sq_lengths(j) / far;
     nearness.set(j, near), weights.set(j, (1 - constants.vote_falloff * near) * counted[j]);
@@ -69,7 +59,7 @@ Planes vote(const Patch& patch, const Column& counted, Lanes noise, const Planes
     const Lanes score = support(patch, weights, a / reach, b / reach, c / reach, Lanes{});
     const Flags is_better = (sq_area > 0) & (score > best);
     best = where(is_better, score, best);
-    planes = where(is_better, Planes{a, b, c}, planes);
+    planes = choose(is_better, Planes{a, b, c}, planes);
   }
   for (int i = 0; i < constants.num_refits; i++) refit(patch, weights, reach, false, planes);
   for (int j = 0; j < patch.width; j++)
@@ -81,12 +71,10 @@ Planes vote(const Patch& patch, const Column& counted, Lanes noise, const Planes
 
 // hypotheses._off_surface: the points off a surface, on its more populated side.
 INLINE void beyond(const Column& distances, int width, Lanes gap, Column& flags) {
-  Lanes over{}, under{};
-  for (int j = 0; j < width; j++) {
-    over += one_where(distances[j] > gap);
-    under += one_where(distances[j] < -gap);
-  }
-  const Lanes sign = where(under <= over, all(1), all(-1));
+  Lanes balance{};
+  for (int j = 0; j < width; j++)
+    balance += one_where(distances[j] > gap) - one_where(distances[j] < -gap);
+  const Lanes sign = side_where(balance >= 0);
   for (int j = 0; j < width; j++) flags.set(j, one_where(distances[j] * sign > gap));
 }
 
@@ -99,12 +87,11 @@ INLINE Lanes near(const Planes& planes, const Patch& patch, int j, Lanes gap) {
 template <bool is_corner>
 Meeting alternate(const Patch& patch, Column& first, Column& second, Column& third, Column& outer,
                   const Constants& constants) {
-  static thread_local Column storage[3];
-  Column &r = storage[0], &s = storage[1], &t = storage[2];
+  Column r, s, t;
   const int width = patch.width;
   Flags present = ~Flags{};
   Lanes cuts{};
-  Planes one, other, last;
+  Fits one, other, last;
   const auto check = [&](Lanes a, Lanes b, Lanes c) {
     const Lanes fewest = is_corner ? smaller(smaller(a, b), c) : smaller(a, b);
     present = present & (fewest >= constants.minimum);
@@ -120,11 +107,12 @@ Meeting alternate(const Patch& patch, Column& first, Column& second, Column& thi
       const Lanes g = last.residuals(patch, j);
       t.set(j, g), sums[2] += g * (first[j] + second[j]);
     });
-    const Lanes u = side(inside[0]), v = side(inside[1]), w = side(inside[2]);
+    const Lanes u = side_where(inside[0] >= 0), v = side_where(inside[1] >= 0),
+                w = side_where(inside[2] >= 0);
     if (is_corner && turn == 0) {
       const Sums<1> cut = add_up<1>(
           width, [&](int j, Lanes* sums) { *sums += smaller(r[j] * u, s[j] * v) * third[j]; });
-      cuts = side(cut[0]);
+      cuts = side_where(cut[0] >= 0);
     }
     Flags same = ~Flags{};
     for (int j = 0; j < width; j++) {
@@ -145,8 +133,8 @@ Meeting alternate(const Patch& patch, Column& first, Column& second, Column& thi
   const Sums<1> squares =
       add_up<1>(width, [&](int j, Lanes* sums) { *sums += outer[j] * outer[j]; });
   const float freedom = larger(float(width - (is_corner ? 9 : 6)), 1.0f);
-  const Planes of_two = where(second[0] > 0, other, one);
-  return {is_corner ? where(third[0] > 0, last, of_two) : of_two,
+  const Planes of_two = choose(second[0] > 0, other, one);
+  return {is_corner ? choose(third[0] > 0, last, of_two) : of_two,
           where(present, roots_of(squares[0] / freedom), all(INFINITE))};
 }
 
@@ -161,12 +149,9 @@ struct Corners {
 // hypotheses.fit_meeting_planes: the best of two and of three planes.
 Meeting meet(Corners& corners, const Planes& voted, const Meeting& best, Lanes noise,
              const Pairs& pairs, const Constants& constants) {
-  static thread_local Patch moved_storage;
-  static thread_local Column storage[3];
   const Patch& patch = corners.patch;
-  Patch& moved = moved_storage;
-  Column &first = corners.first, &outer = corners.outer;
-  Column &second = storage[0], &third = storage[1], &remaining = storage[2];
+  Patch moved;
+  Column &first = corners.first, &outer = corners.outer, second, third, remaining;
   const int width = moved.width = patch.width;
   const Lanes gap = constants.gap * noise, minimum = constants.corner_fraction * best.deviation;
   // Start from the two planes and the points off them.
@@ -225,17 +210,14 @@ KERNEL broken_planes(int64_t num_points, int64_t num_rows, int64_t k, int64_t nu
                      Floats normals, Longs pairs, Floats numbers, float* voted,
                      float* voted_offsets, float* meeting, float* meeting_offsets,
                      float* deviations) {
-  static thread_local Corners storage;
-  static thread_local Column columns[3];
   if (4 * num_constants != sizeof(Constants)) return TOO_WIDE;
-  Constants constants;
-  __builtin_memcpy(&constants, numbers, sizeof constants);
+  const Constants constants = read_as<Constants>(numbers);
   const float turns = constants.num_alternations;
   if (!(turns >= 1 && turns < MAX_WIDTH && constants.num_refits < MAX_WIDTH)) return TOO_WIDE;
   const Lists lists = {num_points, num_rows, k, points, indices, mask};
   const Pairs candidates = {pairs, num_pairs};
-  Corners& corners = storage;
-  Column &first = columns[0], &second = columns[1], &outer = columns[2];
+  Corners corners;
+  Column first, second, outer;
   const auto write = [&](const Rows& rows, const Meeting& found) {
     found.planes.write(rows, meeting, meeting_offsets), rows.write(found.deviation, deviations);
   };

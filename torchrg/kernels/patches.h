@@ -86,13 +86,11 @@ struct Rows {
       lanes[lane] = values[num_columns * numbers[lane] + column];
     return load(lanes);
   }
-  // The same of their neighbors of one rank.
-  INLINE_MEMBER Lanes near(Floats values, Ints indices, int64_t k, int64_t rank, int num_columns,
-                           int column) const {
-    float lanes[LANES];
-    for (int lane = 0; lane < LANES; lane++)
-      lanes[lane] = values[num_columns * int64_t(indices[numbers[lane] * k + rank]) + column];
-    return load(lanes);
+  // Their neighbors of one rank.
+  INLINE_MEMBER Rows neighbors(Ints indices, int64_t k, int64_t rank) const {
+    Rows found = *this;
+    for (int64_t& number : found.numbers) number = indices[number * k + rank];
+    return found;
   }
   INLINE_MEMBER Flags flags(Flagged mask, int64_t k = 1, int64_t column = 0) const {
     float lanes[LANES];
@@ -132,67 +130,79 @@ INLINE void transpose(FourFloats (&rows)[4]) {
 }
 
 // Whether the lists of rows have valid indices; fetches the lists of the next rows into the cache.
-INLINE bool are_lists(Ints indices, int64_t k, const Rows& rows, int64_t num_points) {
+INLINE bool are_lists(const Lists& lists, const Rows& rows) {
   constexpr int LINE = 16;
+  const int64_t k = lists.k;
   for (int64_t j = 0; j < LANES * k; j += LINE)
-    __builtin_prefetch(indices + (rows.numbers[LANES - 1] + 1) * k + j);
+    __builtin_prefetch(lists.indices + (rows.numbers[LANES - 1] + 1) * k + j);
   bool inside = true;
-  for (int64_t number : rows.numbers) inside &= are_rows(indices + number * k, k, num_points);
+  for (int64_t number : rows.numbers)
+    inside &= are_rows(lists.indices + number * k, k, lists.num_points);
   return inside;
 }
 
-// Gathers the neighbors of lists; false if an index is out of range.
-INLINE bool gather(const Lists& lists, const Rows& rows, Patch& patch) {
-  const int k = patch.width = int(lists.k);
-  if (!are_lists(lists.indices, k, rows, lists.num_points)) return false;
-  for (int half = 0; half < LANES; half += 4) {
-    FourFloats first[4];
-    for (int j = 0; j < k; j++) {
-      FourFloats found[4];
-      for (int lane = 0; lane < 4; lane++) {
-        const int32_t row = lists.indices[rows.numbers[half + lane] * k + j];
-        const float* point = lists.points + 3 * int64_t(row);
-        double pair;
-        __builtin_memcpy(&pair, point, sizeof pair);
-        found[lane] = FourFloats(TwoDoubles{pair, 0});
-        found[lane][2] = point[2];
-      }
-      transpose(found);
-      for (int axis = 0; axis < 3; axis++) {
-        if (j == 0) first[axis] = found[axis];
-        found[axis] -= first[axis];
-      }
-      patch.x.set_half(j, half, found[0]), patch.y.set_half(j, half, found[1]);
-      patch.z.set_half(j, half, found[2]), patch.weight.set(j, all(1));
+// Gathers `size` adjacent numbers, 3 or 4, of the neighbors of one rank of four rows.
+template <int size>
+INLINE void gather_four(Floats values, int num_columns, Ints indices, int64_t k,
+                        const int64_t* rows, int64_t rank, FourFloats (&found)[4]) {
+  for (int lane = 0; lane < 4; lane++) {
+    const float* from = values + num_columns * int64_t(indices[rows[lane] * k + rank]);
+    if (size == 4) {
+      found[lane] = read_as<FourFloats>(from);
+    } else {
+      found[lane] = FourFloats(TwoDoubles{read_as<double>(from), 0});
+      found[lane][2] = from[2];
     }
   }
-  if (lists.mask)
-    for (int j = 0; j < k; j++) {
-      for (int lane = 0; lane < LANES; lane++)
-        patch.weight.at(j, lane) = lists.mask[rows.numbers[lane] * k + j];
-      const Flags counts = patch.weight[j] > 0;
-      Column* columns[] = {&patch.x, &patch.y, &patch.z};
-      for (Column* column : columns) column->set(j, where(counts, (*column)[j], all(0)));
-    }
-  return true;
+  transpose(found);
 }
 
-// Calls `visit` with rows and their patches, eight at a time, for all lists or n rows.
+// Gathers the neighbors of lists.
+INLINE void gather(const Lists& lists, const Rows& rows, Patch& patch) {
+  const int k = patch.width = int(lists.k);
+  Column* columns[] = {&patch.x, &patch.y, &patch.z};
+  for (int half = 0; half < LANES; half += 4) {
+    FourFloats first[4], found[4];
+    for (int j = 0; j < k; j++) {
+      gather_four<3>(lists.points, 3, lists.indices, k, rows.numbers + half, j, found);
+      for (int axis = 0; axis < 3; axis++) {
+        if (j == 0) first[axis] = found[axis];
+        columns[axis]->set_half(j, half, found[axis] - first[axis]);
+      }
+      patch.weight.set(j, all(1));
+    }
+  }
+  for (int j = 0; lists.mask && j < k; j++) {
+    const Flags counts = rows.flags(lists.mask, k, j);
+    patch.weight.set(j, one_where(counts));
+    for (Column* column : columns) column->set(j, where(counts, (*column)[j], all(0)));
+  }
+}
+
+// Calls `visit` with all rows or n rows, eight at a time, whose lists have valid indices.
 template <class Visit>
-INLINE int64_t visit_patches(const Lists& lists, Longs rows, int64_t n, const Visit& visit) {
+INLINE int64_t visit_rows(const Lists& lists, Longs rows, int64_t n, const Visit& visit) {
   if (lists.k < 1 || lists.k > MAX_WIDTH) return TOO_WIDE;
-  static thread_local Patch patch;
   Rows eight;
   for (int64_t q = 0; q < n; q += LANES) {
-    if (!eight.set(rows, q, n, lists.num_lists) || !gather(lists, eight, patch)) return NO_SUCH_ROW;
-    visit(eight, patch);
+    if (!eight.set(rows, q, n, lists.num_lists) || !are_lists(lists, eight)) return NO_SUCH_ROW;
+    visit(eight);
   }
   return DONE;
 }
+// The same with their patches.
+template <class Visit>
+INLINE int64_t visit_patches(const Lists& lists, Longs rows, int64_t n, const Visit& visit) {
+  Patch patch;
+  return visit_rows(lists, rows, n, [&](const Rows& eight) {
+    gather(lists, eight, patch);
+    visit(eight, patch);
+  });
+}
 
-// Planes normal . q = offset, the eigenvalues of their covariances, and their weights.
+// Planes normal . q = offset.
 struct Planes {
-  Lanes a{}, b{}, c{}, offset{}, low{}, middle{}, high{}, count{};
+  Lanes a{}, b{}, c{}, offset{};
 
   INLINE_MEMBER Lanes residuals(const Patch& patch, int j) const {
     return patch.along(a, b, c, j) - offset;
@@ -209,12 +219,15 @@ INLINE Planes planes_of(const Rows& rows, Floats normals, Floats offsets = nullp
   return {rows.of(normals, 3, 0), rows.of(normals, 3, 1), rows.of(normals, 3, 2),
           offsets ? rows.of(offsets) : Lanes{}};
 }
-INLINE Planes where(Flags flags, const Planes& p, const Planes& q) {
-  return {where(flags, p.a, q.a),       where(flags, p.b, q.b),
-          where(flags, p.c, q.c),       where(flags, p.offset, q.offset),
-          where(flags, p.low, q.low),   where(flags, p.middle, q.middle),
-          where(flags, p.high, q.high), where(flags, p.count, q.count)};
+INLINE Planes choose(Flags flags, const Planes& p, const Planes& q) {
+  return {where(flags, p.a, q.a), where(flags, p.b, q.b), where(flags, p.c, q.c),
+          where(flags, p.offset, q.offset)};
 }
+
+// Least-squares planes, the eigenvalues of their covariances, and their weights.
+struct Fits : Planes {
+  Lanes low{}, middle{}, high{}, count{};
+};
 
 struct Vector {
   double x, y, z;
@@ -255,7 +268,7 @@ struct Eigenvectors {
   INLINE_MEMBER void start(const Wide (&covariances)[6]) {
     Wide scale{};
     for (const Wide& entry : covariances) scale = larger(scale, magnitude(entry));
-    safe = scale > 0 ? scale : Wide{} + 1;
+    safe = where(scale > 0, scale, Wide{} + 1);
     xx = covariances[0] / safe, xy = covariances[1] / safe, xz = covariances[2] / safe;
     yy = covariances[3] / safe, yz = covariances[4] / safe, zz = covariances[5] / safe;
     trace = xx + yy + zz;
@@ -270,7 +283,7 @@ struct Eigenvectors {
     const Wide slope = (3 * root - 2 * trace) * root + minors;
     const Wide step = value / slope, size = magnitude(step);
     const WideFlags can_move = moves & (size < double(INFINITE));
-    root = can_move ? root - step : root;
+    root = where(can_move, root - step, root);
     if (may_stop) moves = can_move & (size > CONVERGED * trace);
   }
   // The vector, and the eigenvalues in ascending order.
@@ -304,28 +317,30 @@ struct Eigenvectors {
 };
 
 // Normals and eigenvalues of covariances xx xy xz yy yz zz.
-static Planes decompose(const Sums<6>& covariances) {
+static Fits decompose(const Sums<6>& covariances) {
   constexpr int FIRST_STEPS = 4, STEPS = 40, PARTS = LANES / WIDE;
-  Narrow columns[6][PARTS];
-  for (int i = 0; i < 6; i++) __builtin_memcpy(columns[i], &covariances[i], sizeof(Lanes));
+  struct Parts {
+    Narrow parts[PARTS];
+  } columns[6];
+  for (int i = 0; i < 6; i++) columns[i] = read_as<Parts>(&covariances[i]);
   Eigenvectors parts[PARTS];
   WideFlags moves = ~WideFlags{};
   Wide wide[6];
   for (int part = 0; part < PARTS; part++) {
-    for (int i = 0; i < 6; i++) wide[i] = __builtin_convertvector(columns[i][part], Wide);
+    for (int i = 0; i < 6; i++) wide[i] = __builtin_convertvector(columns[i].parts[part], Wide);
     parts[part].start(wide);
   }
   for (int i = 1; i <= STEPS && is_any(moves); i++) {
     moves = WideFlags{};
     for (Eigenvectors& part : parts) part.step(i >= FIRST_STEPS), moves |= part.moves;
   }
+  Lanes found[6];
   for (int part = 0; part < PARTS; part++) {
     parts[part].finish(wide);
-    for (int i = 0; i < 6; i++) columns[i][part] = __builtin_convertvector(wide[i], Narrow);
+    for (int i = 0; i < 6; i++) columns[i].parts[part] = __builtin_convertvector(wide[i], Narrow);
   }
-  Lanes found[6];
-  for (int i = 0; i < 6; i++) __builtin_memcpy((void*)&found[i], columns[i], sizeof(Lanes));
-  return {found[0], found[1], found[2], Lanes{}, found[3], found[4], found[5]};
+  for (int i = 0; i < 6; i++) found[i] = read_as<Lanes>(&columns[i]);
+  return {Planes{found[0], found[1], found[2]}, found[3], found[4], found[5], Lanes{}};
 }
 
 // Weight sums, means and covariances of patches with nonnegative weights.
@@ -339,7 +354,7 @@ INLINE Moments moments(const Patch& patch, const Column& weights, int width) {
     sum[0] += weight, sum[1] += weight * patch.x[j];
     sum[2] += weight * patch.y[j], sum[3] += weight * patch.z[j];
   });
-  const Lanes inverse = where(sums[0] > 0, 1 / sums[0], all(1));
+  const Lanes inverse = 1 / or_one(sums[0]);
   const Lanes a = sums[1] * inverse, b = sums[2] * inverse, c = sums[3] * inverse;
   const Sums<6> covariance = add_up<6>(width, [&](int j, Lanes* sum) {
     const Lanes x = patch.x[j] - a, y = patch.y[j] - b, z = patch.z[j] - c;
@@ -348,6 +363,13 @@ INLINE Moments moments(const Patch& patch, const Column& weights, int width) {
     sum[3] += wy * y, sum[4] += wy * z, sum[5] += scaled * z * z;
   });
   return {sums[0], {a, b, c}, covariance};
+}
+
+// The sum of 0 and 1, in any order.
+INLINE Lanes sum(const Column& values, int width) {
+  Lanes sums{};
+  for (int j = 0; j < width; j++) sums += values[j];
+  return sums;
 }
 
 INLINE Lanes farthest(const Patch& patch, const Column& weights) {
@@ -369,9 +391,9 @@ INLINE Lanes support(const Patch& patch, const Column& weights, Lanes a, Lanes b
 }
 
 // torchrg.linalg.moments.fit_weighted_planes.
-INLINE Planes fit_planes(const Patch& patch, const Column& weights, int width) {
+INLINE Fits fit_planes(const Patch& patch, const Column& weights, int width) {
   const Moments found = moments(patch, weights, width);
-  Planes planes = decompose(found.covariance);
-  planes.offset = planes.project(found.mean), planes.count = found.count;
-  return planes;
+  Fits fits = decompose(found.covariance);
+  fits.offset = fits.project(found.mean), fits.count = found.count;
+  return fits;
 }

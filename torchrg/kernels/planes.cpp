@@ -10,16 +10,15 @@ KERNEL fit_normals_pca(int64_t num_points, int64_t num_rows, int64_t k, Floats p
   const Lists lists = {num_points, num_rows, k, points, indices, mask};
   return visit_patches(lists, nullptr, num_rows, [&](const Rows& rows, const Patch& patch) {
     const Moments found = moments(patch, patch.weight, patch.width);
-    Planes planes = decompose(found.covariance);
+    const Fits fits = decompose(found.covariance);
     const Lanes sum = found.covariance[0] + found.covariance[3] + found.covariance[5];
-    const Lanes length = roots_of(planes.high), width = roots_of(planes.middle);
+    const Lanes length = roots_of(fits.high), width = roots_of(fits.middle);
     const Flags is_wide = width >= float(narrow_fraction) * length;
     const Flags is_valid = width > larger(float(tolerance) * length, rows.of(resolution));
-    planes = where(is_valid, planes, Planes{});
-    planes.write(rows, normals);
-    const Lanes fraction = planes.low / where(sum > 0, sum, all(1));
-    rows.write(where(is_valid, smaller(fraction, all(1 / 3.0f)), all(0)), curvature);
-    rows.write(roots_of(planes.low), residual_rms);
+    const Lanes low = where(is_valid, fits.low, all(0));
+    choose(is_valid, fits, Planes{}).write(rows, normals);
+    rows.write(smaller(low / or_one(sum), all(1 / 3.0f)), curvature);
+    rows.write(roots_of(low), residual_rms);
     for (int l = 0; l < rows.used; l++)
       narrow[rows.positions[l]] = !is_wide[l], valid[rows.positions[l]] = is_valid[l];
   });
@@ -29,7 +28,7 @@ namespace {
 
 // torchrg.normals.consensus.noise._small_deviations: RMS residual of the first neighbors.
 INLINE Lanes of_few(const Patch& patch, int count, float breadth) {
-  const Planes planes = fit_planes(patch, patch.weight, count);
+  const Fits planes = fit_planes(patch, patch.weight, count);
   const Sums<1> squares = add_up<1>(count, [&](int j, Lanes* sum) {
     const Lanes residual = planes.residuals(patch, j);
     *sum += residual * residual;
@@ -42,23 +41,25 @@ INLINE Lanes of_few(const Patch& patch, int count, float breadth) {
 // torchrg.normals.consensus.noise._layered_deviations: mean squares of the residuals from two
 // parallel planes, without the checks of the result.
 Lanes of_layers(const Patch& patch, Planes planes, Lanes count, int num_refits, float min_count) {
-  static thread_local Column upper, lower;
+  Column upper, lower;
+  Lanes square{};
   for (int turn = 0;; turn++) {
-    Lanes number{};
     for (int j = 0; j < patch.width; j++) {
       const Lanes weight = patch.weight[j];
       upper.set(j, where(planes.residuals(patch, j) > 0, weight, all(0)));
-      lower.set(j, weight - upper[j]), number += upper[j];
+      lower.set(j, weight - upper[j]);
     }
+    const Lanes number = sum(upper, patch.width);
     if (turn == num_refits)
-      return where(smaller(number, count - number) < min_count, all(INFINITE), planes.low);
+      return where(smaller(number, count - number) < min_count, all(INFINITE), square);
     const Moments above = moments(patch, upper, patch.width);
     const Moments below = moments(patch, lower, patch.width);
     Sums<6> pooled;
     for (int i = 0; i < 6; i++)
       pooled.sums[i] =
           above.count / count * above.covariance[i] + below.count / count * below.covariance[i];
-    planes = decompose(pooled);
+    const Fits fits = decompose(pooled);
+    planes = fits, square = fits.low;
     planes.offset = (planes.project(above.mean) + planes.project(below.mean)) / 2;
   }
 }
@@ -73,14 +74,13 @@ KERNEL survey(int64_t num_points, int64_t num_rows, int64_t k, Floats points, In
               int64_t min_count, float* offsets, float* radius, float* whole, float* layered,
               bool* again, float* of_fewer, float* of_more) {
   if (few < 4 || more < 4 || uint64_t(num_refits) > MAX_WIDTH) return TOO_WIDE;
-  static thread_local Patch thick;
+  Patch thick;
   const Lists lists = {num_points, num_rows, k, points, indices, mask};
   Rows flat;
   flat.used = 0;
   const auto try_layers = [&] {
     gather(lists, flat, thick);
-    Lanes count{};
-    for (int j = 0; j < k; j++) count += thick.weight[j];
+    const Lanes count = sum(thick.weight, thick.width);
     const Lanes square = of_layers(thick, planes_of(flat, normals, offsets), count, int(num_refits),
                                    float(min_count));
     const Lanes found = roots_of(square * count / larger(count - 4, all(1)));

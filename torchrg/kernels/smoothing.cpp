@@ -8,18 +8,19 @@ namespace {
 constexpr int ROW = 8, NORMAL = 3, OFFSET = 6, NUMBER = 7;
 
 // Gathers columns of the table rows of neighbors.
-INLINE void gather_near(Floats table, Ints indices, int64_t k, const Rows& rows, Column* near) {
+INLINE void gather_near(Floats table, const Lists& lists, const Rows& rows, Column* near) {
   for (int half = 0; half < LANES; half += 4)
-    for (int j = 0; j < k; j++)
+    for (int j = 0; j < lists.k; j++)
       for (int column = 0; column < ROW; column += 4) {
         FourFloats found[4];
-        for (int lane = 0; lane < 4; lane++) {
-          const int64_t row = indices[rows.numbers[half + lane] * k + j];
-          __builtin_memcpy(&found[lane], table + ROW * row + column, sizeof found[lane]);
-        }
-        transpose(found);
+        gather_four<4>(table + column, ROW, lists.indices, lists.k, rows.numbers + half, j, found);
         for (int i = 0; i < 4; i++) near[column + i].set_half(j, half, found[i]);
       }
+}
+
+INLINE Planes own_planes(Floats table, const Rows& rows) {
+  return {rows.of(table, ROW, NORMAL), rows.of(table, ROW, NORMAL + 1),
+          rows.of(table, ROW, NORMAL + 2), rows.of(table, ROW, OFFSET)};
 }
 
 }  // namespace
@@ -29,20 +30,15 @@ KERNEL smooth_planes(int64_t num_points, int64_t k, int64_t num_rows, Floats tab
                      Flagged mask, Floats noise, Longs rows, double agreement, double reach,
                      double falloff, double ridge, double max_tilt, float* normals,
                      float* offsets) {
-  if (k < 1 || k > MAX_WIDTH) return TOO_WIDE;
-  static thread_local Column near[ROW], others[2];
+  const Lists lists = {num_points, num_points, k, nullptr, indices, mask};
+  Column near[ROW], weights, signs;
   Column &x = near[0], &y = near[1], &z = near[2], &residuals = near[OFFSET];
   Column &a = near[NORMAL], &b = near[NORMAL + 1], &c = near[NORMAL + 2], &errors = near[NUMBER];
-  Column &weights = others[0], &signs = others[1];
   const int width = int(k);
   const float sq_agreement = float(agreement * agreement);
-  Rows eight;
-  for (int64_t q = 0; q < num_rows; q += LANES) {
-    if (!eight.set(rows, q, num_rows, num_points) || !are_lists(indices, k, eight, num_points))
-      return NO_SUCH_ROW;
-    gather_near(table, indices, k, eight, near);
-    const Lanes normal[3] = {eight.of(table, ROW, NORMAL), eight.of(table, ROW, NORMAL + 1),
-                             eight.of(table, ROW, NORMAL + 2)};
+  return visit_rows(lists, rows, num_rows, [&](const Rows& eight) {
+    gather_near(table, lists, eight, near);
+    const Planes own = own_planes(table, eight);
     const Lanes sq_first = errors[0] * errors[0], first[3] = {x[0], y[0], z[0]};
     Lanes sq_radius{};
     for (int j = 0; j < width; j++) {
@@ -50,12 +46,12 @@ KERNEL smooth_planes(int64_t num_points, int64_t k, int64_t num_rows, Floats tab
       x.set(j, u), y.set(j, v), z.set(j, w);
       sq_radius = larger(sq_radius, u * u + v * v + w * w);
     }
-    const Lanes far = where(sq_radius > 0, sq_radius, all(1)), radius = roots_of(far);
+    const Lanes far = or_one(sq_radius), radius = roots_of(far);
     const Lanes within = float(reach) * eight.of(noise);
     const Sums<9> s = add_up<9>(width, [&](int j, Lanes* sum) {
       Lanes u = x[j], v = y[j], w = z[j];
       const Lanes p = a[j], q = b[j], r = c[j], sq_error = errors[j] * errors[j];
-      const Lanes cosine = p * normal[0] + q * normal[1] + r * normal[2];
+      const Lanes cosine = own.project({p, q, r});
       const Lanes residual = -(p * u + q * v + r * w) - residuals[j], ratio = residual / within;
       const Lanes sq_angle = sq_agreement * (sq_error + sq_first);
       Lanes weight = positive(1 - 2 * (1 - magnitude(cosine)) / sq_angle);
@@ -65,7 +61,7 @@ KERNEL smooth_planes(int64_t num_points, int64_t k, int64_t num_rows, Floats tab
       if (mask) weight = where(eight.flags(mask, k, j), weight, all(0));
       u /= radius, v /= radius, w /= radius;
       x.set(j, u), y.set(j, v), z.set(j, w), residuals.set(j, residual);
-      weights.set(j, weight), signs.set(j, where(cosine >= 0, all(1), all(-1)));
+      weights.set(j, weight), signs.set(j, side_where(cosine >= 0));
       const Lanes wu = weight * u, wv = weight * v, ww = weight * w;
       sum[0] += wu, sum[1] += wv, sum[2] += ww, sum[3] += wu * u, sum[4] += wu * v;
       sum[5] += wu * w, sum[6] += wv * v, sum[7] += wv * w, sum[8] += ww * w;
@@ -89,12 +85,10 @@ KERNEL smooth_planes(int64_t num_points, int64_t k, int64_t num_rows, Floats tab
       sum[3] += turned * residuals[j], sum[4] += weight;
     });
     const Lanes length = roots_of(sums[0] * sums[0] + sums[1] * sums[1] + sums[2] * sums[2]);
-    const Flags found = length > 0;
-    for (int axis = 0; axis < 3; axis++)
-      eight.write(where(found, sums[axis] / length, normal[axis]), normals, 3, axis);
-    eight.write(where(found, -sums[3] / sums[4], eight.of(table, ROW, OFFSET)), offsets);
-  }
-  return DONE;
+    const Planes turned = {sums[0] / length, sums[1] / length, sums[2] / length,
+                           -sums[3] / sums[4]};
+    choose(length > 0, turned, own).write(eight, normals, offsets);
+  });
 }
 
 // smoothing._best_neighbor_planes: the best plane among every `step`-th neighbor.
@@ -104,22 +98,21 @@ KERNEL choose_planes(int64_t num_points, int64_t k, int64_t num_rows, Floats tab
                      float* offsets) {
   if (step < 1) return TOO_WIDE;
   const Lists lists = {num_points, num_points, k, points, indices, mask};
-  static thread_local Column weights;
+  Column weights;
   return visit_patches(lists, rows, num_rows, [&](const Rows& eight, const Patch& patch) {
-    const Lanes max_square = farthest(patch, patch.weight);
-    const Lanes far = where(max_square > 0, max_square, all(1));
+    const Lanes far = or_one(farthest(patch, patch.weight));
     const Sums<1> sum = add_up<1>(patch.width, [&](int j, Lanes* total) {
       const Lanes near = float(vote_falloff) * patch.sq_lengths(j) / far;
       const Lanes weight = (1 - near) * patch.weight[j];
       weights.set(j, weight), *total += weight;
     });
     const Lanes noise = eight.of(table, ROW, NUMBER), within = float(vote_reach) * noise;
-    Planes best = {eight.of(table, ROW, NORMAL), eight.of(table, ROW, NORMAL + 1),
-                   eight.of(table, ROW, NORMAL + 2), eight.of(table, ROW, OFFSET)};
+    Planes best = own_planes(table, eight);
     Lanes highest = all(-INFINITE), first[ROW], other[ROW];
     for (int64_t rank = 0; rank < k; rank += step) {
+      const Rows neighbors = eight.neighbors(indices, k, rank);
       for (int column = 0; column < ROW; column++) {
-        other[column] = eight.near(table, indices, k, rank, ROW, column);
+        other[column] = neighbors.of(table, ROW, column);
         if (rank == 0) first[column] = other[column];
       }
       const Lanes a = other[NORMAL], b = other[NORMAL + 1], c = other[NORMAL + 2];
@@ -132,7 +125,7 @@ KERNEL choose_planes(int64_t num_points, int64_t k, int64_t num_rows, Floats tab
       const Flags is_better = (magnitude(shift) < float(inlier_reach)) &
                               (a * a + b * b + c * c > 0) & (score > highest);
       highest = where(is_better, score, highest);
-      best = where(is_better, Planes{a, b, c, moved}, best);
+      best = choose(is_better, Planes{a, b, c, moved}, best);
     }
     best.write(eight, normals, offsets);
   });
@@ -143,14 +136,14 @@ KERNEL inliers(int64_t num_points, int64_t k, int64_t num_rows, Floats points, I
                Flagged mask, Floats normals, Floats offsets, Floats noise, Longs rows, double reach,
                float* count, float* values) {
   const Lists lists = {num_points, num_points, k, points, indices, mask};
-  static thread_local Column weights;
+  Column weights;
   return visit_patches(lists, rows, num_rows, [&](const Rows& eight, const Patch& patch) {
     const Planes planes = planes_of(eight, normals, offsets);
     const Lanes limit = float(reach) * eight.of(noise);
     for (int j = 0; j < patch.width; j++)
       weights.set(j,
                   where(magnitude(planes.residuals(patch, j)) <= limit, patch.weight[j], all(0)));
-    const Planes fitted = fit_planes(patch, weights, patch.width);
+    const Fits fitted = fit_planes(patch, weights, patch.width);
     eight.write(fitted.count, count), eight.write(fitted.low, values, 3, 0);
     eight.write(fitted.middle, values, 3, 1), eight.write(fitted.high, values, 3, 2);
   });
@@ -162,14 +155,13 @@ KERNEL fit_paraboloids(int64_t num_points, int64_t k, int64_t num_rows, Floats p
                        float* offsets, float* deviations) {
   constexpr int TERMS = 6, COUNT = 28;
   const Lists lists = {num_points, num_points, k, points, indices, mask};
-  static thread_local Column storage[3];
-  Column &us = storage[0], &vs = storage[1], &heights = storage[2];
+  Column us, vs, heights;
   return visit_patches(lists, rows, num_rows, [&](const Rows& eight, const Patch& patch) {
     const Lanes radius = roots_of(farthest(patch, patch.weight));
     const Lanes scale = where(radius > 0, 1 / radius, all(0));
     const Lanes x = eight.of(normals, 3, 0), y = eight.of(normals, 3, 1),
                 z = eight.of(normals, 3, 2);
-    const Lanes sign = where(z < 0, all(-1), all(1)), a = -1 / (sign + z), b = x * y * a;
+    const Lanes sign = side_where(~(z < 0)), a = -1 / (sign + z), b = x * y * a;
     const Lanes first[3] = {1 + sign * x * x * a, sign * b, -sign * x};
     const Lanes second[3] = {b, sign + y * y * a, -y};
     // The sums of products of terms, of terms and heights, and of weights.
