@@ -5,8 +5,6 @@
 
 namespace {
 
-typedef const double* Doubles;
-
 constexpr int BLOCK = 128;
 constexpr int AHEAD = 64;  // pixels that are loaded early
 
@@ -99,13 +97,13 @@ double select(double* values, int64_t count, int64_t k) {
   return is_within ? select_by_parts(values, within, k - below) : select_by_parts(values, count, k);
 }
 
-// Calls `visit` with each run of equal labels and its first and past-the-end index. Many runs are
-// long, and counting point by point would wait for every write of a count.
+// Calls `visit` with each run of equal labels, not negative, and its first and past-the-end index.
+// Many runs are long, and counting point by point would wait for every write of a count.
 template <class Visit>
 void visit_runs(Longs labels, int64_t n, const Visit& visit) {
   for (int64_t from = 0, to = 0; from < n; from = to) {
     while (to < n && labels[to] == labels[from]) to++;
-    visit(labels[from], from, to);
+    if (labels[from] >= 0) visit(labels[from], from, to);
   }
 }
 
@@ -118,31 +116,6 @@ int64_t visit_regions(int64_t n, int64_t num, Longs counts, const Visit& visit) 
     visit(m, start, start + counts[m]);
   }
   return DONE;
-}
-
-// Segments.coordinates: coordinates (A, n) of rows along the axes of their regions, about centers.
-template <class T>
-int64_t project(int64_t P, int64_t n, int64_t num, int64_t num_axes, const T* x, const T* y,
-                const T* z, Longs rows, Longs counts, Doubles centers, Doubles axes,
-                double* coordinates) {
-  for (int64_t i = 0; i < n; i++)
-    if (rows[i] < 0 || rows[i] >= P) return NO_SUCH_ROW;
-  double u[BLOCK], v[BLOCK], w[BLOCK];
-  return visit_regions(n, num, counts, [&](int64_t m, int64_t start, int64_t end) {
-    const double *center = centers + 3 * m, *axis = axes + 3 * num_axes * m;
-    for (int64_t from = start; from < end; from += BLOCK) {
-      const int count = int(smaller(end - from, int64_t(BLOCK)));
-      for (int j = 0; j < count; j++) {
-        const int64_t row = rows[from + j];
-        u[j] = x[row] - center[0], v[j] = y[row] - center[1], w[j] = z[row] - center[2];
-      }
-      for (int64_t a = 0; a < num_axes; a++) {
-        const double p = axis[3 * a], q = axis[3 * a + 1], r = axis[3 * a + 2];
-        for (int j = 0; j < count; j++)
-          coordinates[a * n + from + j] = u[j] * p + v[j] * q + w[j] * r;
-      }
-    }
-  });
 }
 
 // Mean (3) and covariance (9) of weighted points, about zero if not centered.
@@ -178,9 +151,7 @@ void reweigh(Doubles x, Doubles y, Doubles z, int64_t start, int64_t end, Double
              Doubles axis, double min_scale, double mad, double cut, double* weights,
              double& median, double& square) {
   const double a = mean[0], b = mean[1], c = mean[2], p = axis[0], q = axis[1], r = axis[2];
-  const auto residual = [&](int64_t i) {
-    return (x[i] - a) * p + (y[i] - b) * q + (z[i] - c) * r;
-  };
+  const auto residual = [&](int64_t i) { return (x[i] - a) * p + (y[i] - b) * q + (z[i] - c) * r; };
   for (int64_t i = start; i < end; i++) {
     const double away = size_of(residual(i));
     weights[i] = away < double(INFINITE) ? away : double(INFINITE);
@@ -200,16 +171,19 @@ void reweigh(Doubles x, Doubles y, Doubles z, int64_t start, int64_t end, Double
 
 }  // namespace
 
-KERNEL segment_coordinates(int64_t P, int64_t n, int64_t num, int64_t num_axes, Floats x, Floats y,
-                           Floats z, Longs rows, Longs counts, Doubles centers, Doubles axes,
+// Segments.coordinates: coordinates (A, n) along the axes of regions, about their centers.
+KERNEL segment_coordinates(int64_t n, int64_t num, int64_t num_axes, Doubles x, Doubles y,
+                           Doubles z, Longs counts, Doubles centers, Doubles axes,
                            double* coordinates) {
-  return project(P, n, num, num_axes, x, y, z, rows, counts, centers, axes, coordinates);
-}
-
-KERNEL segment_coordinates_double(int64_t P, int64_t n, int64_t num, int64_t num_axes, Doubles x,
-                                  Doubles y, Doubles z, Longs rows, Longs counts, Doubles centers,
-                                  Doubles axes, double* coordinates) {
-  return project(P, n, num, num_axes, x, y, z, rows, counts, centers, axes, coordinates);
+  return visit_regions(n, num, counts, [&](int64_t m, int64_t start, int64_t end) {
+    for (int64_t a = 0; a < num_axes; a++) {
+      const double *center = centers + 3 * m, *axis = axes + 3 * (num_axes * m + a);
+      const double p = axis[0], q = axis[1], r = axis[2];
+      for (int64_t i = start; i < end; i++)
+        coordinates[a * n + i] =
+            (x[i] - center[0]) * p + (y[i] - center[1]) * q + (z[i] - center[2]) * r;
+    }
+  });
 }
 
 // Segments.rows, counts and sizes. Large regions are subsampled at a regular step to at most
@@ -217,13 +191,13 @@ KERNEL segment_coordinates_double(int64_t P, int64_t n, int64_t num, int64_t num
 KERNEL segment_rows(int64_t n, int64_t num, Longs labels, int64_t max_points, int64_t* counts,
                     int64_t* sizes, int64_t* ends, int64_t* rows) {
   if (max_points < 1) return TOO_WIDE;
-  int64_t highest = -1;
-  for (int64_t i = 0; i < n; i++) highest = larger(labels[i], highest);
-  if (highest >= num) return NO_SUCH_ROW;
+  bool inside = true;
   for (int64_t m = 0; m < num; m++) sizes[m] = counts[m] = 0;
   visit_runs(labels, n, [&](int64_t m, int64_t from, int64_t to) {
-    if (m >= 0) sizes[m] += to - from;
+    inside &= m < num;
+    if (inside) sizes[m] += to - from;
   });
+  if (!inside) return NO_SUCH_ROW;
   const auto step_of = [&](int64_t m) {
     return larger((sizes[m] + max_points - 1) / max_points, int64_t(1));
   };
@@ -231,7 +205,6 @@ KERNEL segment_rows(int64_t n, int64_t num, Longs labels, int64_t max_points, in
     ends[m] = start, start += (sizes[m] + step_of(m) - 1) / step_of(m);
   // counts[m] is the number of points up to the next sample.
   visit_runs(labels, n, [&](int64_t m, int64_t from, int64_t to) {
-    if (m < 0) return;
     const int64_t step = step_of(m);
     int64_t next = from + counts[m];
     for (; next < to; next += step) rows[ends[m]++] = next;
@@ -268,8 +241,7 @@ KERNEL fit_pixel_regions(int64_t h, int64_t w, int64_t n, int64_t num, Doubles v
                          double* centers, double* covariances, double* normals, double* mean_noise,
                          double* medians, double* squares) {
   if (num_fits < 1 || num_fits > MAX_WIDTH) return TOO_WIDE;
-  for (int64_t i = 0; i < n; i++)
-    if (rows[i] < 0 || rows[i] >= h * w) return NO_SUCH_ROW;
+  if (!are_rows(rows, n, h * w)) return NO_SUCH_ROW;
   double *u = buffers, *v = u + n, *z = v + n, *weights = z + n;
   return visit_regions(n, num, counts, [&](int64_t m, int64_t start, int64_t end) {
     for (int64_t i = start, first = 0, row = 0; i < end; i++) {

@@ -182,10 +182,11 @@ class Segments:
 
         ``vectors`` are ``(N, 3)``, ``axes`` ``(M, A, 3)``; returns A columns ``(n,)``, float64.
         """
-        if self.are_served(centers) and vectors.dtype in (torch.float32, torch.float64):
-            name = "segment_coordinates" + "_double" * (vectors.dtype == torch.float64)
-            columns = *vectors.unbind(dim=1), self.rows, self.counts, centers, axes
-            return list(kernels.call(name, *columns)[0])
+        if self.are_served(centers):
+            tables = self.counts, centers, axes
+            return list(
+                kernels.call("segment_coordinates", *self.gather_columns(vectors), *tables)[0]
+            )
         about, found = self.gather_centered(vectors, centers), []
         for axis in axes.unbind(dim=1):
             total = torch.zeros_like(about[0])
