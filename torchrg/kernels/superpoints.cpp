@@ -11,22 +11,6 @@ INLINE void widen(const float* values, double* wide) {
   for (int axis = 0; axis < 3; axis++) wide[axis] = values[axis];
 }
 
-// Shellsort in place: rows are few, or almost sorted.
-void sort_by_second(int64_t count, int32_t* second, double* contacts, double* differences) {
-  int64_t gap = 1;
-  while (gap < count / 3) gap = 3 * gap + 1;
-  for (; gap > 0; gap /= 3)
-    for (int64_t i = gap; i < count; i++) {
-      const int32_t key = second[i];
-      const double contact = contacts[i], difference = differences[i];
-      int64_t j = i;
-      for (; j >= gap && second[j - gap] > key; j -= gap)
-        second[j] = second[j - gap], contacts[j] = contacts[j - gap],
-        differences[j] = differences[j - gap];
-      second[j] = key, contacts[j] = contact, differences[j] = difference;
-    }
-}
-
 }  // namespace
 
 // superpoints._contact_differences
@@ -36,7 +20,7 @@ KERNEL contact_differences(int64_t num_points, int64_t num_rows, int64_t k, Floa
   double normal[3], other[3], offset[3], change[3];
   for (int64_t q = 0; q < num_rows; q++, nearest += k, differences += k) {
     const int64_t i = rows[q];
-    if (i < 0 || i >= num_points || !are_rows(nearest, k, num_points)) return NO_SUCH_ROW;
+    if (!is_row(i, num_points) || !are_rows(nearest, k, num_points)) return NO_SUCH_ROW;
     widen(normals + 3 * i, normal);
     for (int64_t j = 0; j < k; j++) {
       const int64_t t = nearest[j];
@@ -55,47 +39,48 @@ KERNEL contact_differences(int64_t num_points, int64_t num_rows, int64_t k, Floa
   return DONE;
 }
 
-// superpoints._aggregate: groups rows by the smaller region, sums equal pairs, and sorts the
-// rows of a region by the larger region.
-KERNEL aggregate_boundaries(int64_t num_rows, int64_t num_starts, Ints a, Ints b,
-                            const double* contacts, const double* differences, int64_t* starts,
-                            int64_t* slots, int64_t* order, int32_t* first, int32_t* second,
-                            double* sum_contacts, double* sum_differences, int64_t* count) {
-  for (int64_t r = 0; r < num_starts; r++) starts[r] = 0, slots[r] = -1;
+// superpoints._aggregate: sums rows of equal pairs of different regions, in the order of the smaller
+// region, then of the larger one.
+KERNEL aggregate_boundaries(int64_t num_rows, int64_t num_starts, Ints a, Ints b, Doubles contacts,
+                            Doubles differences, int64_t* starts, int64_t* others, int64_t* order,
+                            int32_t* first, int32_t* second, double* sum_contacts,
+                            double* sum_differences, int64_t* count) {
+  if (num_rows > INT32_MAX) return TOO_WIDE;
+  for (int64_t r = 0; r < num_starts; r++) starts[r] = others[r] = 0;
   for (int64_t e = 0; e < num_rows; e++) {
     const int64_t low = smaller(a[e], b[e]), high = larger(a[e], b[e]);
     if (low < 0 || high >= num_starts - 1) return NO_SUCH_ROW;
-    starts[low + 1] += low != high;
+    starts[low + 1] += low != high, others[high + 1] += low != high;
   }
-  for (int64_t r = 1; r < num_starts; r++) starts[r] += starts[r - 1];
+  for (int64_t r = 1; r < num_starts; r++) starts[r] += starts[r - 1], others[r] += others[r - 1];
+  const int64_t num_different = num_starts ? starts[num_starts - 1] : 0;
   for (int64_t e = 0; e < num_rows; e++)
-    if (a[e] != b[e]) order[starts[smaller(a[e], b[e])]++] = e;
-  int64_t end = 0, q = 0;
-  for (int64_t low = 0; low + 1 < num_starts; low++) {
-    const int64_t begin = end;
-    for (; q < starts[low]; q++) {
-      const int64_t e = order[q], high = larger(a[e], b[e]);
-      if (slots[high] < begin) {
-        slots[high] = end, first[end] = low, second[end] = high;
-        sum_contacts[end] = sum_differences[end] = 0, end++;
-      }
-      sum_contacts[slots[high]] += contacts ? contacts[e] : 1;
-      sum_differences[slots[high]] += differences[e];
+    if (a[e] != b[e]) second[others[larger(a[e], b[e])]++] = int32_t(e);
+  for (int64_t q = 0; q < num_different; q++)
+    order[starts[smaller(a[second[q]], b[second[q]])]++] = second[q];
+  int64_t last = -1;
+  for (int64_t q = 0; q < num_different; q++) {
+    const int64_t e = order[q];
+    const int32_t low = smaller(a[e], b[e]), high = larger(a[e], b[e]);
+    if (last < 0 || first[last] != low || second[last] != high) {
+      last++, first[last] = low, second[last] = high;
+      sum_contacts[last] = sum_differences[last] = 0;
     }
-    sort_by_second(end - begin, second + begin, sum_contacts + begin, sum_differences + begin);
+    sum_contacts[last] += contacts ? contacts[e] : 1;
+    sum_differences[last] += differences[e];
   }
-  *count = end;
+  *count = last + 1;
   return DONE;
 }
 
 // superpoints._merge_costs
 KERNEL merging_costs(int64_t num_regions, int64_t num_features, int64_t dims, int64_t num_borders,
-                     const double* size, const double* means, const double* low, const double* high,
-                     Ints first, Ints second, const double* contacts, const double* differences,
-                     double min_cost, double bound, double* costs) {
+                     Doubles size, Doubles means, Doubles low, Doubles high, Ints first,
+                     Ints second, Doubles contacts, Doubles differences, double min_cost,
+                     double bound, double* costs) {
   for (int64_t e = 0; e < num_borders; e++) {
     const int64_t a = first[e], b = second[e];
-    if (a < 0 || b < 0 || a >= num_regions || b >= num_regions) return NO_SUCH_ROW;
+    if (!is_row(a, num_regions) || !is_row(b, num_regions)) return NO_SUCH_ROW;
     double difference = differences[e] / contacts[e] + min_cost;
     for (int64_t f = 0; f < num_features; f++) {
       const double step = means[a * num_features + f] - means[b * num_features + f];
@@ -114,12 +99,12 @@ KERNEL merging_costs(int64_t num_regions, int64_t num_features, int64_t dims, in
 
 // superpoints._cheapest
 KERNEL cheapest_boundaries(int64_t num_borders, int64_t num_regions, Ints first, Ints second,
-                           const double* costs, double* lowest, int64_t* best) {
+                           Doubles costs, double* lowest, int64_t* best) {
   for (int64_t r = 0; r < num_regions; r++) best[r] = num_borders;
   for (int64_t e = 0; e < num_borders; e++)
     for (int end = 0; end < 2; end++) {
       const int64_t r = end ? second[e] : first[e];
-      if (r < 0 || r >= num_regions) return NO_SUCH_ROW;
+      if (!is_row(r, num_regions)) return NO_SUCH_ROW;
       if (costs[e] < lowest[r]) lowest[r] = costs[e], best[r] = e;
     }
   return DONE;

@@ -183,10 +183,8 @@ class Segments:
         ``vectors`` are ``(N, 3)``, ``axes`` ``(M, A, 3)``; returns A columns ``(n,)``, float64.
         """
         if self.are_served(centers):
-            tables = self.counts, centers, axes
-            return list(
-                kernels.call("segment_coordinates", *self.gather_columns(vectors), *tables)[0]
-            )
+            columns, tables = self.gather_columns(vectors), (self.counts, centers, axes)
+            return list(kernels.call("segment_coordinates", *columns, *tables)[0])
         about, found = self.gather_centered(vectors, centers), []
         for axis in axes.unbind(dim=1):
             total = torch.zeros_like(about[0])
