@@ -2,45 +2,17 @@
 // torchrg/normals/faces.py and free_space.py.
 #include "plain.h"
 
-namespace {
-
-// Disjoint-set forest. The root of a tree is its first node; signs are relative to the parent.
-struct Forest {
-  int32_t* parents;
-  bool *is_flipped, *is_contradictory;
-
-  // Replaces a node by its root with path halving; returns whether the signs of both differ.
-  INLINE_MEMBER bool climb(int32_t& node) const {
-    bool flipped = false;
-    // Parents come before their children; a node of a broken forest becomes -1.
-    for (int32_t parent = parents[node]; parent != node; parent = parents[node]) {
-      const int32_t above = parent >= 0 && parent < node ? parents[parent] : -1;
-      if (above < 0 || above > parent) {
-        node = -1;
-        return false;
-      }
-      is_flipped[node] ^= is_flipped[parent];  // A root is not flipped.
-      parents[node] = above;
-      flipped ^= is_flipped[node], node = above;
-    }
-    return flipped;
-  }
-};
-
-}  // namespace
-
 // faces._find_links: links of rows to neighbors at some ranks, which are in another group and bend
 // by at most the limit; agreement of their normals, and bend.
 KERNEL find_links(int64_t num_points, int64_t k, int64_t num_rows, int64_t num_ranks, Floats points,
                   Floats normals, Ints near, Longs rows, Longs ranks, Ints groups, double max_bend,
                   int32_t* starts, int32_t* ends, float* cosines, float* bends, int64_t* count) {
-  for (int64_t r = 0; r < num_ranks; r++)
-    if (ranks[r] < 0 || ranks[r] >= k) return TOO_WIDE;
+  if (!are_rows(ranks, num_ranks, k)) return TOO_WIDE;
   const float limit = float(max_bend);
   int64_t link = 0;
   for (int64_t i = 0; i < num_rows; i++) {
     const int64_t start = rows[i];
-    if (start < 0 || start >= num_points) return NO_SUCH_ROW;
+    if (!is_row(start, num_points)) return NO_SUCH_ROW;
     const float *point = points + 3 * start, *normal = normals + 3 * start;
     for (int64_t r = 0; r < num_ranks; r++) {
       const int32_t neighbor = near[start * k + ranks[r]];
@@ -70,44 +42,40 @@ KERNEL split_plates(int64_t num_points, int64_t num_rows, int64_t num_faces, Flo
                     Longs rows, Longs faces, Floats axes, double max_square, double max_height,
                     double min_two_sided, bool* sides, bool* are_thin, double* heights,
                     double* means, double* squares, int64_t* counts) {
-  for (int64_t i = 0; i < num_rows; i++) {
-    const int64_t face = faces[i], row = rows[i];
-    if (face < 0 || face >= num_faces || row < 0 || row >= num_points) return NO_SUCH_ROW;
-    const float *point = points + 3 * row, *axis = axes + 3 * face;
-    heights[i] = point[0] * axis[0] + point[1] * axis[1] + point[2] * axis[2];
-  }
+  if (!are_rows(faces, num_rows, num_faces) || !are_rows(rows, num_rows, num_points))
+    return NO_SUCH_ROW;
   for (int64_t face = 0; face < num_faces; face++) counts[face] = 0;
-  for (int64_t i = 0; i < num_rows; i++) counts[faces[i]]++;
-  const auto average = [&](const auto& value) {
-    for (int64_t face = 0; face < num_faces; face++) means[face] = 0;
-    for (int64_t i = 0; i < num_rows; i++) means[faces[i]] += value(heights[i]);
+  for (int64_t i = 0; i < num_rows; i++) {
+    const float *point = points + 3 * rows[i], *axis = axes + 3 * faces[i];
+    heights[i] = point[0] * axis[0] + point[1] * axis[1] + point[2] * axis[2];
+    counts[faces[i]]++;
+  }
+  const auto average = [&](double* averages, const auto& value) {
+    for (int64_t face = 0; face < num_faces; face++) averages[face] = 0;
+    for (int64_t i = 0; i < num_rows; i++) averages[faces[i]] += value(heights[i]);
     for (int64_t face = 0; face < num_faces; face++)
-      means[face] /= double(larger(counts[face], int64_t(1)));
+      averages[face] /= double(larger(counts[face], int64_t(1)));
   };
-  const auto itself = [](double height) { return height; };
+  const auto center = [&] {
+    average(means, [](double height) { return height; });
+    for (int64_t i = 0; i < num_rows; i++) heights[i] -= means[faces[i]];
+  };
   const auto size = [](double height) { return size_of(height); };
-  const auto square = [](double height) { return height * height; };
-  average(itself);
-  for (int64_t i = 0; i < num_rows; i++) heights[i] -= means[faces[i]];
+  center();
   for (int pass = 0; pass < 2; pass++) {
-    average(size);
+    average(means, size);
     for (int64_t i = 0; i < num_rows; i++) {
       const double reach = max_height * means[faces[i]];
       heights[i] = larger(smaller(heights[i], reach), -reach);
     }
-    average(itself);
-    for (int64_t i = 0; i < num_rows; i++) heights[i] -= means[faces[i]];
+    center();
   }
-  average(square);
-  for (int64_t i = 0; i < num_rows; i++) sides[i] = heights[i] > 0;
-  for (int64_t face = 0; face < num_faces; face++)
-    are_thin[face] = means[face] <= max_square, squares[face] = means[face];
-  average(size);
+  average(squares, [](double height) { return height * height; });
+  average(means, size);
+  for (int64_t face = 0; face < num_faces; face++) are_thin[face] = squares[face] <= max_square;
   for (int64_t i = 0; i < num_rows; i++) {
-    const int64_t face = faces[i];
-    const bool is_plate =
-        are_thin[face] && means[face] * means[face] > min_two_sided * squares[face];
-    sides[i] &= is_plate;
+    const double mean = means[faces[i]], square = squares[faces[i]];
+    sides[i] = (heights[i] > 0) & are_thin[faces[i]] & (mean * mean > min_two_sided * square);
   }
   return DONE;
 }
@@ -139,25 +107,37 @@ KERNEL free_gaps(int64_t num_cells, int64_t num_slots, Ints cells, int64_t x, in
   return DONE;
 }
 
+// Joins the trees of linked nodes of a signed forest. The root of a tree is its first node, parents
+// come before their children, and signs are relative to the parent; a root is not flipped.
 KERNEL link_nodes(int64_t num_links, int64_t num_nodes, Ints starts, Ints ends, Flagged flips,
                   int32_t* parents, bool* is_flipped, bool* is_contradictory) {
   if (!are_rows(starts, num_links, num_nodes) || !are_rows(ends, num_links, num_nodes))
     return NO_SUCH_ROW;
-  const Forest forest = {parents, is_flipped, is_contradictory};
+  bool inside = true;
+  // Replaces a node by its root with path halving; returns whether the signs of both differ.
+  const auto climb = [&](int32_t& node) {
+    bool flipped = false;
+    for (int32_t parent = parents[node]; parent != node; parent = parents[node]) {
+      const int32_t above = is_row(parent, node) ? parents[parent] : -1;
+      inside &= is_row(above, int64_t(parent) + 1);
+      if (!inside) break;
+      is_flipped[node] ^= is_flipped[parent];
+      flipped ^= is_flipped[node];
+      node = parents[node] = above;
+    }
+    return flipped;
+  };
   for (int64_t i = 0; i < num_links; i++) {
-    int32_t low = starts[i], high = ends[i];
-    const bool differs = forest.climb(low) ^ forest.climb(high) ^ flips[i];
-    if (low < 0 || high < 0) return NO_SUCH_ROW;
+    int32_t one = starts[i], other = ends[i];
+    const bool differs = climb(one) ^ climb(other) ^ flips[i];
+    if (!inside) return NO_SUCH_ROW;
+    const int32_t low = smaller(one, other), high = larger(one, other);
     if (low == high) {
       is_contradictory[low] |= differs;
-      continue;
+    } else {
+      parents[high] = low, is_flipped[high] = differs;
+      is_contradictory[low] |= is_contradictory[high];
     }
-    if (low > high) {
-      const int32_t other = low;
-      low = high, high = other;
-    }
-    parents[high] = low, is_flipped[high] = differs;
-    is_contradictory[low] |= is_contradictory[high];
   }
   return DONE;
 }
@@ -167,7 +147,7 @@ KERNEL flatten_nodes(int64_t num_nodes, int32_t* parents, bool* is_flipped,
                      bool* is_contradictory) {
   for (int64_t node = 0; node < num_nodes; node++) {
     const int32_t parent = parents[node];
-    if (parent < 0 || parent > node) return NO_SUCH_ROW;
+    if (!is_row(parent, node + 1)) return NO_SUCH_ROW;
     if (parent == node) continue;
     is_flipped[node] ^= is_flipped[parent], is_contradictory[node] = is_contradictory[parent];
     parents[node] = parents[parent];
