@@ -38,28 +38,26 @@ void refit(const Patch& patch, const Column& weights, Lanes reach, bool bisquare
 }
 
 // hypotheses.vote_planes
-Planes vote(const Patch& patch, const Column& counted, Lanes noise, const Planes& start,
+Planes vote(const Patch& patch, const Column& counted, Lanes noise, const Vectors& start,
             const Pairs& pairs, const Constants& constants) {
   Column weights, nearness;
   const Lanes far = or_one(farthest(patch, counted));
   for (int j = 0; j < patch.width; j++) {
-    const Lanes near = patch.sq_lengths(j) / far;
+    const Lanes near = dot(patch[j], patch[j]) / far;
     nearness.set(j, near), weights.set(j, (1 - constants.vote_falloff * near) * counted[j]);
   }
   const Lanes reach = constants.vote_reach * noise;
-  Planes planes = {start.a, start.b, start.c};
-  Lanes best = support(patch, weights, start.a / reach, start.b / reach, start.c / reach, Lanes{});
+  Planes planes = {start};
+  Lanes best = support(patch, weights, {start / reach});
   for (int64_t pair = 0; pair < pairs.num; pair++) {
-    const int p = int(pairs.ranks[2 * pair]), q = int(pairs.ranks[2 * pair + 1]);
-    Lanes a = patch.y[p] * patch.z[q] - patch.z[p] * patch.y[q];
-    Lanes b = patch.z[p] * patch.x[q] - patch.x[p] * patch.z[q];
-    Lanes c = patch.x[p] * patch.y[q] - patch.y[p] * patch.x[q];
-    const Lanes sq_area = a * a + b * b + c * c, length = roots_of(sq_area);
-    a /= length, b /= length, c /= length;
-    const Lanes score = support(patch, weights, a / reach, b / reach, c / reach, Lanes{});
+    const Vectors p = patch[int(pairs.ranks[2 * pair])], q = patch[int(pairs.ranks[2 * pair + 1])];
+    const Vectors product = {p.y * q.z - p.z * q.y, p.z * q.x - p.x * q.z, p.x * q.y - p.y * q.x};
+    const Lanes sq_area = dot(product, product);
+    const Vectors normal = product / roots_of(sq_area);
+    const Lanes score = support(patch, weights, {normal / reach});
     const Flags is_better = (sq_area > 0) & (score > best);
     best = where(is_better, score, best);
-    planes = choose(is_better, Planes{a, b, c}, planes);
+    planes = choose(is_better, {normal}, planes);
   }
   for (int i = 0; i < constants.num_refits; i++) refit(patch, weights, reach, false, planes);
   for (int j = 0; j < patch.width; j++)
@@ -162,17 +160,14 @@ Meeting meet(Corners& corners, const Planes& voted, const Meeting& best, Lanes n
   }
   const Meeting by_two = alternate<true>(patch, first, second, third, outer, constants);
   // Start from the voted plane and the plane voted by the remaining points.
-  Lanes x = patch.x[0], y = patch.y[0], z = patch.z[0];
+  Vectors origin = patch[0];
   for (int j = width - 1; j >= 0; j--) {
     const Lanes is_near = near(voted, patch, j, gap);
-    const Flags is_left = is_near < 1;
     first.set(j, is_near), remaining.set(j, 1 - is_near);
-    x = where(is_left, patch.x[j], x), y = where(is_left, patch.y[j], y);
-    z = where(is_left, patch.z[j], z);
+    origin = where(is_near < 1, patch[j], origin);
   }
-  for (int j = 0; j < width; j++)
-    moved.x.set(j, patch.x[j] - x), moved.y.set(j, patch.y[j] - y), moved.z.set(j, patch.z[j] - z);
-  const Planes start = fit_planes(moved, remaining, width);
+  for (int j = 0; j < width; j++) moved.set(j, patch[j] - origin);
+  const Vectors start = fit_planes(moved, remaining, width).normal;
   const Planes other = vote(moved, remaining, noise, start, pairs, constants);
   for (int j = 0; j < width; j++) {
     const Lanes is_near = near(other, moved, j, gap) * remaining[j];
@@ -191,8 +186,8 @@ bool compact(Patch& patch) {
     int end = 0;
     for (int j = 0; j < patch.width; j++) {
       if (patch.weight.at(j, lane) == 0) continue;
-      patch.x.at(end, lane) = patch.x.at(j, lane), patch.y.at(end, lane) = patch.y.at(j, lane);
-      patch.z.at(end, lane) = patch.z.at(j, lane), patch.weight.at(end++, lane) = 1;
+      for (Column& column : patch.columns) column.at(end, lane) = column.at(j, lane);
+      patch.weight.at(end++, lane) = 1;
     }
     if (lane == 0) count = end;
     if (end != count) return false;
@@ -238,7 +233,7 @@ KERNEL broken_planes(int64_t num_points, int64_t num_rows, int64_t k, int64_t nu
         if (!inside) return;
         const int width = corners.patch.width = patch.width;
         const Lanes scale = rows.of(noise), gap = constants.gap * scale;
-        const Planes start = planes_of(rows, normals);
+        const Vectors start = rows.vectors(normals);
         const Planes planes = vote(patch, patch.weight, scale, start, candidates, constants);
         for (int j = 0; j < width; j++) {
           outer.set(j, planes.residuals(patch, j)), first.set(j, near(planes, patch, j, gap));
@@ -253,8 +248,9 @@ KERNEL broken_planes(int64_t num_points, int64_t num_rows, int64_t k, int64_t nu
           const auto copy = [&](const Column& column, Column& copied) {
             for (int j = 0; j < width; j++) copied.at(j, to) = column.at(j, lane);
           };
-          copy(patch.x, corners.patch.x), copy(patch.y, corners.patch.y);
-          copy(patch.z, corners.patch.z), copy(first, corners.first), copy(outer, corners.outer);
+          for (int axis = 0; axis < 3; axis++)
+            copy(patch.columns[axis], corners.patch.columns[axis]);
+          copy(first, corners.first), copy(outer, corners.outer);
           if (corners.rows.add(rows.numbers[lane])) finish();
         }
       });

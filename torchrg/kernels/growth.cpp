@@ -9,19 +9,37 @@ constexpr int64_t LINE = 64 / sizeof(int32_t);  // numbers in a line of the cach
 // 1 with the sign of each lane.
 INLINE Lanes sign_of(Lanes values) {
   constexpr int32_t ONE = 0x3F800000;  // the bits of 1
-  Flags bits;
-  __builtin_memcpy((void*)&bits, &values, sizeof bits);
-  bits = (bits & (Flags{} + INT32_MIN)) | (Flags{} + ONE);
-  __builtin_memcpy((void*)&values, &bits, sizeof bits);
-  return values;
+  const Flags signs = read_as<Flags>(&values) & (Flags{} + INT32_MIN);
+  const Flags bits = signs | (Flags{} + ONE);
+  return read_as<Lanes>(&bits);
 }
 
-// angles.sq_chords of one normal and eight others.
-INLINE Lanes sq_chords(float a, float b, float c, Lanes d, Lanes e, Lanes f, bool is_signed) {
-  const Lanes sign = is_signed ? all(1) : sign_of(d * a + e * b + f * c);
-  const Lanes u = d - sign * a, v = e - sign * b, w = f - sign * c;
-  return u * u + v * v + w * w;
+// angles.sq_chords of normals.
+INLINE Lanes sq_chords(const Vectors& normal, const Vectors& other, bool is_signed) {
+  const Lanes sign = is_signed ? all(1) : sign_of(dot(other, normal));
+  const Vectors turned = other - sign * normal;
+  return dot(turned, turned);
 }
+
+// Vectors of the neighbors in a list.
+struct Near {
+  alignas(32) float values[3][MAX_WIDTH] = {};
+
+  // Gathers them from vectors (3, N).
+  INLINE_MEMBER void gather(Floats vectors, int64_t num_points, Ints list, int64_t k) {
+    const float *x = vectors, *y = x + num_points, *z = y + num_points;
+    for (int64_t j = 0; j < k; j++) {
+      const int32_t t = list[j];
+      values[0][j] = x[t], values[1][j] = y[t], values[2][j] = z[t];
+    }
+  }
+  INLINE_MEMBER Vectors operator[](int64_t j) const {
+    return {load(values[0] + j), load(values[1] + j), load(values[2] + j)};
+  }
+  INLINE_MEMBER Vectors first() const {
+    return {all(values[0][0]), all(values[1][0]), all(values[2][0])};
+  }
+};
 
 // Whether values are within a limit, or the limit is disabled.
 INLINE Flags within(Lanes values, double limit) {
@@ -36,39 +54,31 @@ KERNEL pass_edges(int64_t num_points, int64_t num_rows, int64_t k, Floats points
                   Flagged valid, Floats reach, Ints indices, Flagged mask, double max_sq_chord,
                   double max_sq_distance, int64_t is_signed, bool* joins) {
   if (k < 1 || k > MAX_WIDTH) return TOO_WIDE;
-  const float *x = points, *y = points + num_points, *z = points + 2 * num_points;
-  const float *a = normals, *b = normals + num_points, *c = normals + 2 * num_points;
-  const bool has_positions = reach || max_sq_distance >= 0;
-  alignas(32) float near[7][MAX_WIDTH] = {};
-  alignas(32) int32_t passes[MAX_WIDTH] = {};
+  Near near, near_normals;
+  alignas(32) float reaches[MAX_WIDTH] = {};
+  alignas(32) int32_t passes[MAX_WIDTH];
   for (int64_t q = 0; q < num_rows; q++, indices += k, joins += k) {
     if (!are_rows(indices, k, num_points)) return NO_SUCH_ROW;
     const int32_t i = indices[0];
+    for (int64_t j = 0; reach && j < k; j++) reaches[j] = reach[indices[j]];
+    near_normals.gather(normals, num_points, indices, k);
+    if (reach || max_sq_distance >= 0) near.gather(points, num_points, indices, k);
+    const Vectors point = near.first(), normal = near_normals.first();
+    for (int64_t j = 0; j < k; j += LANES) {
+      const Vectors arm = near[j] - point, other = near_normals[j];
+      Flags passed = within(sq_chords(normal, other, is_signed != 0), max_sq_chord);
+      passed &= within(dot(arm, arm), max_sq_distance);
+      if (reach) {
+        passed &= magnitude(dot(arm, normal)) <= all(reach[i]);
+        passed &= magnitude(dot(arm, other)) <= load(reaches + j);
+      }
+      store(passes + j, passed);
+    }
     for (int64_t j = 0; j < k; j++) {
       const int32_t t = indices[j];
-      near[3][j] = a[t], near[4][j] = b[t], near[5][j] = c[t];
-      passes[j] = -int32_t(valid[i] & valid[t] & (t != i));
+      const bool is_passed = passes[j];
+      joins[j] = valid[i] && valid[t] && t != i && is_passed && (!mask || mask[q * k + j]);
     }
-    for (int64_t j = 0; mask && j < k; j++) passes[j] &= -int32_t(mask[q * k + j]);
-    for (int64_t j = 0; has_positions && j < k; j++) {
-      const int32_t t = indices[j];
-      near[0][j] = x[t], near[1][j] = y[t], near[2][j] = z[t];
-    }
-    for (int64_t j = 0; reach && j < k; j++) near[6][j] = reach[indices[j]];
-    for (int64_t j = 0; j < k; j += LANES) {
-      const Lanes d = load(near[3] + j), e = load(near[4] + j), f = load(near[5] + j);
-      const Lanes chords = sq_chords(a[i], b[i], c[i], d, e, f, is_signed != 0);
-      Flags passed = load(passes + j) & within(chords, max_sq_chord);
-      const Lanes u = load(near[0] + j) - x[i], v = load(near[1] + j) - y[i],
-                  w = load(near[2] + j) - z[i];
-      passed = passed & within(u * u + v * v + w * w, max_sq_distance);
-      if (reach) {
-        passed = passed & (magnitude(u * a[i] + v * b[i] + w * c[i]) <= all(reach[i]));
-        passed = passed & (magnitude(u * d + v * e + w * f) <= load(near[6] + j));
-      }
-      __builtin_memcpy(passes + j, &passed, sizeof passed);
-    }
-    for (int64_t j = 0; j < k; j++) joins[j] = passes[j] != 0;
   }
   return DONE;
 }
@@ -77,17 +87,13 @@ KERNEL pass_edges(int64_t num_points, int64_t num_rows, int64_t k, Floats points
 KERNEL neighbor_chords(int64_t num_points, int64_t num_rows, int64_t k, Floats normals,
                        Ints indices, float* chords) {
   if (k < 1 || k > MAX_WIDTH) return TOO_WIDE;
-  const float *a = normals, *b = normals + num_points, *c = normals + 2 * num_points;
-  alignas(32) float near[3][MAX_WIDTH] = {}, found[MAX_WIDTH];
+  Near near;
+  alignas(32) float found[MAX_WIDTH];
   for (int64_t q = 0; q < num_rows; q++, indices += k, chords += k) {
     if (!are_rows(indices, k, num_points)) return NO_SUCH_ROW;
-    for (int64_t j = 0; j < k; j++) {
-      const int32_t t = indices[j];
-      near[0][j] = a[t], near[1][j] = b[t], near[2][j] = c[t];
-    }
+    near.gather(normals, num_points, indices, k);
     for (int64_t j = 0; j < k; j += LANES)
-      store(found + j, sq_chords(near[0][0], near[1][0], near[2][0], load(near[0] + j),
-                                 load(near[1] + j), load(near[2] + j), false));
+      store(found + j, sq_chords(near.first(), near[j], false));
     for (int64_t j = 0; j < k; j++) chords[j] = found[j];
   }
   return DONE;
@@ -188,16 +194,16 @@ KERNEL crossing_edges(int64_t num_points, int64_t k, int64_t num_rows, Ints labe
 // adjacency._length_on_line: distinct cells of the lines of pairs that contain the middle of an
 // edge. `slots` is a hash table of indices of found cells.
 KERNEL line_cells(int64_t num_points, int64_t num_edges, int64_t num_pairs, int64_t num_slots,
-                  Floats points, Ints sources, Ints targets, Longs pairs, const double* along,
-                  const double* spacing, double max_cell, int32_t* slots, int64_t* owners,
-                  int64_t* cells, int64_t* count) {
+                  Floats points, Ints sources, Ints targets, Longs pairs, Doubles along,
+                  Doubles spacing, double max_cell, int32_t* slots, int64_t* owners, int64_t* cells,
+                  int64_t* count) {
   if (num_slots <= num_edges || num_slots & (num_slots - 1)) return TOO_WIDE;
   const uint64_t mask = uint64_t(num_slots) - 1;
   int32_t found = 0;
   for (int64_t slot = 0; slot < num_slots; slot++) slots[slot] = -1;
   for (int64_t e = 0; e < num_edges; e++) {
     const int64_t pair = pairs[e];
-    if (pair < 0 || pair >= num_pairs || !is_row(sources[e], num_points) ||
+    if (!is_row(pair, num_pairs) || !is_row(sources[e], num_points) ||
         !is_row(targets[e], num_points))
       return NO_SUCH_ROW;
     if (!is_finite(spacing[pair])) continue;

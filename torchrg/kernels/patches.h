@@ -47,15 +47,22 @@ INLINE Sums<T> add_up(int width, const Add& add) {
   return found;
 }
 
-// Eight neighborhoods relative to their first points; weights are 0 or 1.
-struct Patch {
-  Column x, y, z, weight;
-  int width;
+// One vector per point.
+struct VectorColumns {
+  Column columns[3];
 
-  INLINE_MEMBER Lanes along(Lanes a, Lanes b, Lanes c, int j) const {
-    return x[j] * a + y[j] * b + z[j] * c;
+  INLINE_MEMBER Vectors operator[](int j) const {
+    return {columns[0][j], columns[1][j], columns[2][j]};
   }
-  INLINE_MEMBER Lanes sq_lengths(int j) const { return x[j] * x[j] + y[j] * y[j] + z[j] * z[j]; }
+  INLINE_MEMBER void set(int j, const Vectors& vectors) {
+    columns[0].set(j, vectors.x), columns[1].set(j, vectors.y), columns[2].set(j, vectors.z);
+  }
+};
+
+// Eight neighborhoods relative to their first points; weights are 0 or 1.
+struct Patch : VectorColumns {
+  Column weight;
+  int width;
 };
 
 // Eight rows of arrays, and the positions of their results.
@@ -86,6 +93,10 @@ struct Rows {
       lanes[lane] = values[num_columns * numbers[lane] + column];
     return load(lanes);
   }
+  INLINE_MEMBER Vectors vectors(Floats values, int num_columns = 3, int column = 0) const {
+    return {of(values, num_columns, column), of(values, num_columns, column + 1),
+            of(values, num_columns, column + 2)};
+  }
   // Their neighbors of one rank.
   INLINE_MEMBER Rows neighbors(Ints indices, int64_t k, int64_t rank) const {
     Rows found = *this;
@@ -102,6 +113,9 @@ struct Rows {
     store(found, lanes);
     for (int lane = 0; lane < used; lane++)
       values[num_columns * positions[lane] + column] = found[lane];
+  }
+  INLINE_MEMBER void write(const Vectors& vectors, float* values) const {
+    write(vectors.x, values, 3, 0), write(vectors.y, values, 3, 1), write(vectors.z, values, 3, 2);
   }
 };
 
@@ -160,14 +174,13 @@ INLINE void gather_four(Floats values, int num_columns, Ints indices, int64_t k,
 // Gathers the neighbors of lists.
 INLINE void gather(const Lists& lists, const Rows& rows, Patch& patch) {
   const int k = patch.width = int(lists.k);
-  Column* columns[] = {&patch.x, &patch.y, &patch.z};
   for (int half = 0; half < LANES; half += 4) {
     FourFloats first[4], found[4];
     for (int j = 0; j < k; j++) {
       gather_four<3>(lists.points, 3, lists.indices, k, rows.numbers + half, j, found);
       for (int axis = 0; axis < 3; axis++) {
         if (j == 0) first[axis] = found[axis];
-        columns[axis]->set_half(j, half, found[axis] - first[axis]);
+        patch.columns[axis].set_half(j, half, found[axis] - first[axis]);
       }
       patch.weight.set(j, all(1));
     }
@@ -175,7 +188,7 @@ INLINE void gather(const Lists& lists, const Rows& rows, Patch& patch) {
   for (int j = 0; lists.mask && j < k; j++) {
     const Flags counts = rows.flags(lists.mask, k, j);
     patch.weight.set(j, one_where(counts));
-    for (Column* column : columns) column->set(j, where(counts, (*column)[j], all(0)));
+    patch.set(j, where(counts, patch[j], Vectors{}));
   }
 }
 
@@ -202,26 +215,21 @@ INLINE int64_t visit_patches(const Lists& lists, Longs rows, int64_t n, const Vi
 
 // Planes normal . q = offset.
 struct Planes {
-  Lanes a{}, b{}, c{}, offset{};
+  Vectors normal;
+  Lanes offset{};
 
   INLINE_MEMBER Lanes residuals(const Patch& patch, int j) const {
-    return patch.along(a, b, c, j) - offset;
+    return dot(patch[j], normal) - offset;
   }
-  INLINE_MEMBER Lanes project(const Lanes (&point)[3]) const {
-    return a * point[0] + b * point[1] + c * point[2];
-  }
-  INLINE_MEMBER void write(const Rows& rows, float* normals, float* offsets = nullptr) const {
-    rows.write(a, normals, 3, 0), rows.write(b, normals, 3, 1), rows.write(c, normals, 3, 2);
-    if (offsets) rows.write(offset, offsets);
+  INLINE_MEMBER void write(const Rows& rows, float* normals, float* offsets) const {
+    rows.write(normal, normals), rows.write(offset, offsets);
   }
 };
-INLINE Planes planes_of(const Rows& rows, Floats normals, Floats offsets = nullptr) {
-  return {rows.of(normals, 3, 0), rows.of(normals, 3, 1), rows.of(normals, 3, 2),
-          offsets ? rows.of(offsets) : Lanes{}};
+INLINE Planes planes_of(const Rows& rows, Floats normals, Floats offsets) {
+  return {rows.vectors(normals), rows.of(offsets)};
 }
 INLINE Planes choose(Flags flags, const Planes& p, const Planes& q) {
-  return {where(flags, p.a, q.a), where(flags, p.b, q.b), where(flags, p.c, q.c),
-          where(flags, p.offset, q.offset)};
+  return {where(flags, p.normal, q.normal), where(flags, p.offset, q.offset)};
 }
 
 // Least-squares planes, the eigenvalues of their covariances, and their weights.
@@ -340,29 +348,34 @@ static Fits decompose(const Sums<6>& covariances) {
     for (int i = 0; i < 6; i++) columns[i].parts[part] = __builtin_convertvector(wide[i], Narrow);
   }
   for (int i = 0; i < 6; i++) found[i] = read_as<Lanes>(&columns[i]);
-  return {Planes{found[0], found[1], found[2]}, found[3], found[4], found[5], Lanes{}};
+  return {Planes{{found[0], found[1], found[2]}}, found[3], found[4], found[5], Lanes{}};
 }
+
+// Adds the products xx xy xz yy yz zz of two vectors.
+INLINE void add_products(const Vectors& a, const Vectors& b, Lanes* sum) {
+  sum[0] += a.x * b.x, sum[1] += a.x * b.y, sum[2] += a.x * b.z;
+  sum[3] += a.y * b.y, sum[4] += a.y * b.z, sum[5] += a.z * b.z;
+}
+INLINE void add(const Vectors& a, Lanes* sum) { sum[0] += a.x, sum[1] += a.y, sum[2] += a.z; }
 
 // Weight sums, means and covariances of patches with nonnegative weights.
 struct Moments {
-  Lanes count, mean[3];
+  Lanes count;
+  Vectors mean;
   Sums<6> covariance;
 };
 INLINE Moments moments(const Patch& patch, const Column& weights, int width) {
   const Sums<4> sums = add_up<4>(width, [&](int j, Lanes* sum) {
     const Lanes weight = weights[j];
-    sum[0] += weight, sum[1] += weight * patch.x[j];
-    sum[2] += weight * patch.y[j], sum[3] += weight * patch.z[j];
+    sum[0] += weight, add(weight * patch[j], sum + 1);
   });
   const Lanes inverse = 1 / or_one(sums[0]);
-  const Lanes a = sums[1] * inverse, b = sums[2] * inverse, c = sums[3] * inverse;
+  const Vectors mean = inverse * Vectors{sums[1], sums[2], sums[3]};
   const Sums<6> covariance = add_up<6>(width, [&](int j, Lanes* sum) {
-    const Lanes x = patch.x[j] - a, y = patch.y[j] - b, z = patch.z[j] - c;
-    const Lanes scaled = weights[j] * inverse, wx = scaled * x, wy = scaled * y;
-    sum[0] += wx * x, sum[1] += wx * y, sum[2] += wx * z;
-    sum[3] += wy * y, sum[4] += wy * z, sum[5] += scaled * z * z;
+    const Vectors away = patch[j] - mean;
+    add_products(weights[j] * inverse * away, away, sum);
   });
-  return {sums[0], {a, b, c}, covariance};
+  return {sums[0], mean, covariance};
 }
 
 // The sum of 0 and 1, in any order.
@@ -374,15 +387,15 @@ INLINE Lanes sum(const Column& values, int width) {
 
 INLINE Lanes farthest(const Patch& patch, const Column& weights) {
   Lanes maximum{};
-  for (int j = 0; j < patch.width; j++) maximum = larger(maximum, patch.sq_lengths(j) * weights[j]);
+  for (int j = 0; j < patch.width; j++)
+    maximum = larger(maximum, dot(patch[j], patch[j]) * weights[j]);
   return maximum;
 }
 
 // torchrg.normals.consensus.hypotheses.support_scores of planes in units of the reach.
-INLINE Lanes support(const Patch& patch, const Column& weights, Lanes a, Lanes b, Lanes c,
-                     Lanes offset) {
+INLINE Lanes support(const Patch& patch, const Column& weights, const Planes& planes) {
   const Sums<3> sums = add_up<3>(patch.width, [&](int j, Lanes* sum) {
-    const Lanes residual = patch.along(a, b, c, j) - offset, weight = weights[j];
+    const Lanes residual = planes.residuals(patch, j), weight = weights[j];
     sum[0] += positive(1 - residual * residual) * weight;
     sum[1] += where(residual > 1, weight, all(0));
     sum[2] += where(residual < -1, weight, all(0));
@@ -394,6 +407,6 @@ INLINE Lanes support(const Patch& patch, const Column& weights, Lanes a, Lanes b
 INLINE Fits fit_planes(const Patch& patch, const Column& weights, int width) {
   const Moments found = moments(patch, weights, width);
   Fits fits = decompose(found.covariance);
-  fits.offset = fits.project(found.mean), fits.count = found.count;
+  fits.offset = dot(fits.normal, found.mean), fits.count = found.count;
   return fits;
 }

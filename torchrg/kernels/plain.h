@@ -142,6 +142,25 @@ INLINE Lanes roots_of(Lanes squares) {
   for (float& lane : lanes) lane = square_root(lane);
   return load(lanes);
 }
+
+// Eight vectors.
+struct Vectors {
+  Lanes x{}, y{}, z{};
+};
+INLINE Vectors operator-(const Vectors& a, const Vectors& b) {
+  return {a.x - b.x, a.y - b.y, a.z - b.z};
+}
+INLINE Vectors operator*(Lanes factor, const Vectors& a) {
+  return {factor * a.x, factor * a.y, factor * a.z};
+}
+INLINE Vectors operator/(const Vectors& a, Lanes divisor) {
+  return {a.x / divisor, a.y / divisor, a.z / divisor};
+}
+INLINE Lanes dot(const Vectors& a, const Vectors& b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+INLINE Vectors where(Flags flags, const Vectors& a, const Vectors& b) {
+  return {where(flags, a.x, b.x), where(flags, a.y, b.y), where(flags, a.z, b.z)};
+}
+
 INLINE int padded(int count) { return (count + LANES - 1) / LANES * LANES; }
 
 // Whether a number is a row.

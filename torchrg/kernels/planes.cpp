@@ -16,7 +16,7 @@ KERNEL fit_normals_pca(int64_t num_points, int64_t num_rows, int64_t k, Floats p
     const Flags is_wide = width >= float(narrow_fraction) * length;
     const Flags is_valid = width > larger(float(tolerance) * length, rows.of(resolution));
     const Lanes low = where(is_valid, fits.low, all(0));
-    choose(is_valid, fits, Planes{}).write(rows, normals);
+    rows.write(where(is_valid, fits.normal, Vectors{}), normals);
     rows.write(smaller(low / or_one(sum), all(1 / 3.0f)), curvature);
     rows.write(roots_of(low), residual_rms);
     for (int l = 0; l < rows.used; l++)
@@ -60,7 +60,7 @@ Lanes of_layers(const Patch& patch, Planes planes, Lanes count, int num_refits, 
           above.count / count * above.covariance[i] + below.count / count * below.covariance[i];
     const Fits fits = decompose(pooled);
     planes = fits, square = fits.low;
-    planes.offset = (planes.project(above.mean) + planes.project(below.mean)) / 2;
+    planes.offset = (dot(planes.normal, above.mean) + dot(planes.normal, below.mean)) / 2;
   }
 }
 
@@ -90,17 +90,17 @@ KERNEL survey(int64_t num_points, int64_t num_rows, int64_t k, Floats points, In
   const int64_t status =
       visit_patches(lists, nullptr, num_rows, [&](const Rows& rows, const Patch& patch) {
         Flags repeats{};
-        for (int j = 1; j < k; j++)
-          repeats = repeats | ((patch.x[j] == patch.x[j - 1]) & (patch.y[j] == patch.y[j - 1]) &
-                               (patch.z[j] == patch.z[j - 1]));
-        Planes planes = planes_of(rows, normals);
+        for (int j = 1; j < k; j++) {
+          const Vectors one = patch[j], other = patch[j - 1];
+          repeats |= (one.x == other.x) & (one.y == other.y) & (one.z == other.z);
+        }
         const Sums<4> sums = add_up<4>(patch.width, [&](int j, Lanes* sum) {
-          sum[0] += patch.weight[j];
-          sum[1] += patch.x[j], sum[2] += patch.y[j], sum[3] += patch.z[j];
+          sum[0] += patch.weight[j], add(patch[j], sum + 1);
         });
-        const Lanes count = sums[0], some = larger(count, all(1));
-        const Lanes center[3] = {sums[1] / some, sums[2] / some, sums[3] / some};
-        planes.offset = planes.project(center);
+        const Lanes count = sums[0];
+        const Vectors center = Vectors{sums[1], sums[2], sums[3]} / larger(count, all(1));
+        const Vectors normal = rows.vectors(normals);
+        const Planes planes = {normal, dot(normal, center)};
         const Sums<2> powers = add_up<2>(patch.width, [&](int j, Lanes* sum) {
           const Lanes residual = planes.residuals(patch, j);
           const Lanes square = residual * residual * patch.weight[j];
