@@ -150,19 +150,14 @@ KERNEL mark_boundary(int64_t num_points, int64_t k, int64_t num_rows, Ints label
   if (low < 0 || high > k) return TOO_WIDE;
   for (int64_t r = 0; r < num_rows; r++) {
     const int64_t i = rows[r];
-    if (!is_row(rows[r], num_points)) return NO_SUCH_ROW;
-    const int32_t *list = indices + i * k, label = labels[i];
-    if (!are_rows(list + low, high - low, num_points)) return NO_SUCH_ROW;
+    if (!is_row(i, num_points) || !are_rows(indices + i * k + low, high - low, num_points))
+      return NO_SUCH_ROW;
     int32_t differences = 0;
-    for (int64_t j = low; j < high; j++) {
-      const int32_t other = labels[list[j]];
-      differences |= (other ^ label) & ~(other >> 31);  // negative labels do not count
+    for (int64_t e = i * k + low; e < i * k + high; e++) {
+      const int32_t other = labels[indices[e]], counts = -int32_t(!mask || mask[e]);
+      differences |= (other ^ labels[i]) & ~(other >> 31) & counts;  // negative labels do not count
     }
-    meets[r] = false;
-    for (int64_t j = low; differences != 0 && j < high; j++) {
-      const int32_t other = labels[list[j]];
-      meets[r] |= other != label && other >= 0 && (!mask || mask[i * k + j]);
-    }
+    meets[r] = differences != 0;
   }
   return DONE;
 }
