@@ -57,12 +57,13 @@ KERNEL pass_edges(int64_t num_points, int64_t num_rows, int64_t k, Floats points
   Near near, near_normals;
   alignas(32) float reaches[MAX_WIDTH] = {};
   alignas(32) int32_t passes[MAX_WIDTH];
+  const bool has_positions = reach || max_sq_distance >= 0;
   for (int64_t q = 0; q < num_rows; q++, indices += k, joins += k) {
     if (!are_rows(indices, k, num_points)) return NO_SUCH_ROW;
     const int32_t i = indices[0];
     for (int64_t j = 0; reach && j < k; j++) reaches[j] = reach[indices[j]];
     near_normals.gather(normals, num_points, indices, k);
-    if (reach || max_sq_distance >= 0) near.gather(points, num_points, indices, k);
+    if (has_positions) near.gather(points, num_points, indices, k);
     const Vectors point = near.first(), normal = near_normals.first();
     for (int64_t j = 0; j < k; j += LANES) {
       const Vectors arm = near[j] - point, other = near_normals[j];
@@ -76,8 +77,7 @@ KERNEL pass_edges(int64_t num_points, int64_t num_rows, int64_t k, Floats points
     }
     for (int64_t j = 0; j < k; j++) {
       const int32_t t = indices[j];
-      const bool is_passed = passes[j];
-      joins[j] = valid[i] && valid[t] && t != i && is_passed && (!mask || mask[q * k + j]);
+      joins[j] = valid[i] && valid[t] && t != i && passes[j] && (!mask || mask[q * k + j]);
     }
   }
   return DONE;
