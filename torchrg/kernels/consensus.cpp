@@ -12,16 +12,16 @@ struct Constants {
 
 // Ranks of the neighbors that span candidates, two per candidate.
 struct Pairs {
-  const int64_t* ranks;
+  Longs ranks;
   int64_t num;
 };
 
-struct Meeting {
-  Planes planes;
+struct Meeting : Planes {
   Lanes deviation;
 };
 INLINE Meeting choose(Flags flags, const Meeting& a, const Meeting& b) {
-  return {choose(flags, a.planes, b.planes), where(flags, a.deviation, b.deviation)};
+  const Planes &one = a, &other = b;
+  return {choose(flags, one, other), where(flags, a.deviation, b.deviation)};
 }
 
 // hypotheses._refit
@@ -108,9 +108,9 @@ Meeting alternate(const Patch& patch, Column& first, Column& second, Column& thi
     const Lanes u = side_where(inside[0] >= 0), v = side_where(inside[1] >= 0),
                 w = side_where(inside[2] >= 0);
     if (is_corner && turn == 0) {
-      const Sums<1> cut = add_up<1>(
-          width, [&](int j, Lanes* sums) { *sums += smaller(r[j] * u, s[j] * v) * third[j]; });
-      cuts = side_where(cut[0] >= 0);
+      const Lanes cut =
+          sum_of(width, [&](int j) { return smaller(r[j] * u, s[j] * v) * third[j]; });
+      cuts = side_where(cut >= 0);
     }
     Flags same = ~Flags{};
     for (int j = 0; j < width; j++) {
@@ -128,12 +128,11 @@ Meeting alternate(const Patch& patch, Column& first, Column& second, Column& thi
     if (!is_any(~same)) break;  // the next turn would repeat this one
   }
   check(sum(first, width), sum(second, width), sum(third, width));
-  const Sums<1> squares =
-      add_up<1>(width, [&](int j, Lanes* sums) { *sums += outer[j] * outer[j]; });
+  const Lanes square = sum_of(width, [&](int j) { return outer[j] * outer[j]; });
   const float freedom = larger(float(width - (is_corner ? 9 : 6)), 1.0f);
   const Planes of_two = choose(second[0] > 0, other, one);
   return {is_corner ? choose(third[0] > 0, last, of_two) : of_two,
-          where(present, roots_of(squares[0] / freedom), all(INFINITE))};
+          where(present, roots_of(square / freedom), all(INFINITE))};
 }
 
 // Neighborhoods that two planes do not explain, their points of the first plane, and their signed
@@ -174,7 +173,7 @@ Meeting meet(Corners& corners, const Planes& voted, const Meeting& best, Lanes n
     second.set(j, is_near), third.set(j, remaining[j] - is_near);
   }
   const Meeting by_votes = alternate<true>(patch, first, second, third, outer, constants);
-  Meeting three = choose(by_two.deviation < minimum, by_two, Meeting{best.planes, minimum});
+  Meeting three = choose(by_two.deviation < minimum, by_two, Meeting{best, minimum});
   three = choose(by_votes.deviation < three.deviation, by_votes, three);
   return choose(three.deviation < minimum, three, best);
 }
@@ -214,7 +213,7 @@ KERNEL broken_planes(int64_t num_points, int64_t num_rows, int64_t k, int64_t nu
   Corners corners;
   Column first, second, outer;
   const auto write = [&](const Rows& rows, const Meeting& found) {
-    found.planes.write(rows, meeting, meeting_offsets), rows.write(found.deviation, deviations);
+    found.write(rows, meeting, meeting_offsets), rows.write(found.deviation, deviations);
   };
   const auto finish = [&] {
     Rows& rows = corners.rows;
@@ -228,16 +227,14 @@ KERNEL broken_planes(int64_t num_points, int64_t num_rows, int64_t k, int64_t nu
   const int64_t status =
       visit_patches(lists, nullptr, num_rows, [&](const Rows& rows, Patch& patch) {
         if (mask) inside &= compact(patch);
-        for (int64_t rank = 0; rank < 2 * num_pairs; rank++)
-          inside &= pairs[rank] >= 0 && pairs[rank] < patch.width;
+        inside &= are_rows(pairs, 2 * num_pairs, patch.width);
         if (!inside) return;
         const int width = corners.patch.width = patch.width;
         const Lanes scale = rows.of(noise), gap = constants.gap * scale;
         const Vectors start = rows.vectors(normals);
         const Planes planes = vote(patch, patch.weight, scale, start, candidates, constants);
-        for (int j = 0; j < width; j++) {
+        for (int j = 0; j < width; j++)
           outer.set(j, planes.residuals(patch, j)), first.set(j, near(planes, patch, j, gap));
-        }
         beyond(outer, width, gap, second);
         const Meeting two = alternate<false>(patch, first, second, second, outer, constants);
         planes.write(rows, voted, voted_offsets), write(rows, two);

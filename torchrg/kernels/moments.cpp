@@ -10,12 +10,12 @@ constexpr int AHEAD = 64;  // pixels that are loaded early
 
 // Sums the T terms of `count` points from index `from` on; `term` writes the terms of one point.
 template <int T, class Term>
-void add_pairwise(int64_t from, int64_t count, const Term& term, double (&sums)[T]) {
+void add_pairwise(double (&sums)[T], int64_t from, int64_t count, const Term& term) {
   if (count > BLOCK) {
     const int64_t half = count / 2 - count / 2 % LANES;
     double others[T];
-    add_pairwise(from, half, term, sums);
-    add_pairwise(from + half, count - half, term, others);
+    add_pairwise(sums, from, half, term);
+    add_pairwise(others, from + half, count - half, term);
     for (int t = 0; t < T; t++) sums[t] += others[t];
     return;
   }
@@ -40,10 +40,10 @@ void add_pairwise(int64_t from, int64_t count, const Term& term, double (&sums)[
 
 // Like NumPy's reduceat: the first term plus the sum of the remaining terms.
 template <int T, class Term>
-void add_up(int64_t from, int64_t count, const Term& term, double (&sums)[T]) {
+void add_up(double (&sums)[T], int64_t from, int64_t count, const Term& term) {
   double first[T];
   term(from, first);
-  add_pairwise(from + 1, count - 1, term, sums);
+  add_pairwise(sums, from + 1, count - 1, term);
   for (int t = 0; t < T; t++) sums[t] = first[t] + sums[t];
 }
 
@@ -122,26 +122,20 @@ int64_t visit_regions(int64_t n, int64_t num, Longs counts, const Visit& visit) 
 void measure(Doubles x, Doubles y, Doubles z, Doubles weights, int64_t start, int64_t end,
              bool is_centered, double* mean, double* covariance) {
   double sums[4], squares[6];
-  add_up(
-      start, end - start,
-      [&](int64_t i, double* terms) {
-        const double weight = weights[i];
-        terms[0] = x[i] * weight, terms[1] = y[i] * weight, terms[2] = z[i] * weight;
-        terms[3] = weight;
-      },
-      sums);
+  add_up(sums, start, end - start, [&](int64_t i, double* terms) {
+    const double weight = weights[i];
+    terms[0] = x[i] * weight, terms[1] = y[i] * weight, terms[2] = z[i] * weight;
+    terms[3] = weight;
+  });
   const double total = sums[3];
   for (int axis = 0; axis < 3; axis++) mean[axis] = is_centered ? sums[axis] / total : 0;
   const double a = mean[0], b = mean[1], c = mean[2];
-  add_up(
-      start, end - start,
-      [&](int64_t i, double* terms) {
-        const double u = x[i] - a, v = y[i] - b, w = z[i] - c;
-        const double wu = weights[i] * u, wv = weights[i] * v, ww = weights[i] * w;
-        terms[0] = wu * u, terms[1] = wu * v, terms[2] = wu * w;
-        terms[3] = wv * v, terms[4] = wv * w, terms[5] = ww * w;
-      },
-      squares);
+  add_up(squares, start, end - start, [&](int64_t i, double* terms) {
+    const double u = x[i] - a, v = y[i] - b, w = z[i] - c;
+    const double wu = weights[i] * u, wv = weights[i] * v, ww = weights[i] * w;
+    terms[0] = wu * u, terms[1] = wu * v, terms[2] = wu * w;
+    terms[3] = wv * v, terms[4] = wv * w, terms[5] = ww * w;
+  });
   const int index[9] = {0, 1, 2, 1, 3, 4, 2, 4, 5};
   for (int entry = 0; entry < 9; entry++) covariance[entry] = squares[index[entry]] / total;
 }
@@ -158,7 +152,7 @@ void reweigh(Doubles x, Doubles y, Doubles z, int64_t start, int64_t end, Double
   }
   const int64_t count = end - start;
   double sum[1];
-  add_up(start, count, [&](int64_t i, double* term) { *term = weights[i] * weights[i]; }, sum);
+  add_up(sum, start, count, [&](int64_t i, double* term) { *term = weights[i] * weights[i]; });
   square = sum[0] / double(count);
   median = select(weights + start, count, (count - 1) / 2);
   const double min_unit = cut * larger(mad * median, min_scale);
@@ -251,7 +245,7 @@ KERNEL fit_pixel_regions(int64_t h, int64_t w, int64_t n, int64_t num, Doubles v
       u[i] = x[pixel - first], v[i] = y[row], z[i] = values[pixel], weights[i] = 1;
     }
     double sum[1], *center = centers + 3 * m, *s = covariances + 9 * m, *normal = normals + 3 * m;
-    add_up(start, end - start, [&](int64_t i, double* term) { *term = noise[rows[i]]; }, sum);
+    add_up(sum, start, end - start, [&](int64_t i, double* term) { *term = noise[rows[i]]; });
     mean_noise[m] = sum[0] / double(end - start);
     for (int64_t fit = 0; fit < num_fits; fit++) {
       measure(u, v, z, weights, start, end, true, center, s);

@@ -59,6 +59,12 @@ struct VectorColumns {
   }
 };
 
+// The same of one term.
+template <class Term>
+INLINE Lanes sum_of(int width, const Term& term) {
+  return add_up<1>(width, [&](int j, Lanes* sum) { *sum += term(j); })[0];
+}
+
 // Eight neighborhoods relative to their first points; weights are 0 or 1.
 struct Patch : VectorColumns {
   Column weight;
@@ -113,6 +119,9 @@ struct Rows {
     store(found, lanes);
     for (int lane = 0; lane < used; lane++)
       values[num_columns * positions[lane] + column] = found[lane];
+  }
+  INLINE_MEMBER void write(Flags flags, bool* values) const {
+    for (int lane = 0; lane < used; lane++) values[positions[lane]] = flags[lane];
   }
   INLINE_MEMBER void write(const Vectors& vectors, float* values) const {
     write(vectors.x, values, 3, 0), write(vectors.y, values, 3, 1), write(vectors.z, values, 3, 2);

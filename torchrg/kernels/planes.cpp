@@ -19,8 +19,7 @@ KERNEL fit_normals_pca(int64_t num_points, int64_t num_rows, int64_t k, Floats p
     rows.write(where(is_valid, fits.normal, Vectors{}), normals);
     rows.write(smaller(low / or_one(sum), all(1 / 3.0f)), curvature);
     rows.write(roots_of(low), residual_rms);
-    for (int l = 0; l < rows.used; l++)
-      narrow[rows.positions[l]] = !is_wide[l], valid[rows.positions[l]] = is_valid[l];
+    rows.write(~is_wide, narrow), rows.write(is_valid, valid);
   });
 }
 
@@ -29,12 +28,12 @@ namespace {
 // torchrg.normals.consensus.noise._small_deviations: RMS residual of the first neighbors.
 INLINE Lanes of_few(const Patch& patch, int count, float breadth) {
   const Fits planes = fit_planes(patch, patch.weight, count);
-  const Sums<1> squares = add_up<1>(count, [&](int j, Lanes* sum) {
+  const Lanes square = sum_of(count, [&](int j) {
     const Lanes residual = planes.residuals(patch, j);
-    *sum += residual * residual;
+    return residual * residual;
   });
   const Flags is_broad = planes.middle > breadth * planes.high;
-  return where(is_broad & (patch.weight[count - 1] > 0), roots_of(squares[0] / float(count - 3)),
+  return where(is_broad & (patch.weight[count - 1] > 0), roots_of(square / float(count - 3)),
                all(INFINITE));
 }
 
@@ -116,10 +115,9 @@ KERNEL survey(int64_t num_points, int64_t num_rows, int64_t k, Floats points, In
         rows.write(roots_of(farthest(patch, patch.weight)), radius);
         rows.write(few <= k ? of_few(patch, int(few), float(breadth)) : all(INFINITE), of_fewer);
         rows.write(more <= k ? of_few(patch, int(more), float(breadth)) : all(INFINITE), of_more);
-        for (int l = 0; l < rows.used; l++) {
-          again[rows.positions[l]] = repeats[l];
+        rows.write(repeats, again);
+        for (int l = 0; l < rows.used; l++)
           if (is_flat[l] && flat.add(rows.numbers[l])) try_layers();
-        }
       });
   if (flat.used > 0) try_layers();
   return status;
@@ -166,19 +164,16 @@ INLINE Flags select(int32_t* keys, int k, Flags ranks) {
   return ordered(low);
 }
 
-// Gathers some adjacent columns of the neighbors of a row, from a lane on; returns the number of
-// counted neighbors.
-template <int num_lanes>
+// Gathers one or four columns of the neighbors of a row; returns the number of counted neighbors.
+template <class T>
 INLINE int gather_values(Floats column, int64_t num_columns, Ints row, Flagged counted, int64_t k,
-                         int lane, int32_t* values) {
-  float others[num_lanes];
-  for (float& other : others) other = INFINITE;
+                         int32_t* keys) {
   int count = 0;
   for (int64_t j = 0; j < k; j++) {
     const bool counts = !counted || counted[j];
+    const T found = counts ? read_as<T>(column + num_columns * row[j]) : T{} + INFINITE;
+    __builtin_memcpy(keys + LANES * j, &found, sizeof found);
     count += counts;
-    __builtin_memcpy(values + LANES * j + lane, counts ? column + num_columns * row[j] : others,
-                     sizeof others);
   }
   return count;
 }
@@ -200,13 +195,11 @@ KERNEL neighbor_quantiles(int64_t num_points, int64_t num_columns, int64_t num_r
       const float* column = values + entry % num_columns;
       if (!are_rows(row, k, num_points)) return NO_SUCH_ROW;
       width = num_columns % 4 == 0 && start + lane + 4 <= num_found ? 4 : 1;
-      const int count = width == 4
-                            ? gather_values<4>(column, num_columns, row, counted, k, lane, keys)
-                            : gather_values<1>(column, num_columns, row, counted, k, lane, keys);
-      for (int l = lane; l < lane + width; l++) {
-        ranks[l] = int(rank_of_all);
-        if (mask) ranks[l] = larger(int(__builtin_ceilf(float(quantile) * float(count))), 1);
-      }
+      const int count =
+          width == 4 ? gather_values<FourFloats>(column, num_columns, row, counted, k, keys + lane)
+                     : gather_values<float>(column, num_columns, row, counted, k, keys + lane);
+      const float rank = larger(__builtin_ceilf(float(quantile) * float(count)), 1.0f);
+      for (int l = lane; l < lane + width; l++) ranks[l] = int(mask ? rank : rank_of_all);
     }
     const Flags selected = select(keys, int(k), load(ranks));
     const int64_t count = smaller(num_found - start, int64_t(LANES));

@@ -110,10 +110,11 @@ KERNEL choose_planes(int64_t num_points, int64_t k, int64_t num_rows, Floats tab
   Column weights;
   return visit_patches(lists, rows, num_rows, [&](const Rows& eight, const Patch& patch) {
     const Lanes far = or_one(farthest(patch, patch.weight));
-    const Sums<1> sum = add_up<1>(patch.width, [&](int j, Lanes* total) {
+    const Lanes sum = sum_of(patch.width, [&](int j) {
       const Lanes near = float(vote_falloff) * dot(patch[j], patch[j]) / far;
       const Lanes weight = (1 - near) * patch.weight[j];
-      weights.set(j, weight), *total += weight;
+      weights.set(j, weight);
+      return weight;
     });
     const Lanes noise = eight.of(table, ROW, NUMBER), within = float(vote_reach) * noise;
     Planes best = own_planes(table, eight);
@@ -125,7 +126,7 @@ KERNEL choose_planes(int64_t num_points, int64_t k, int64_t num_rows, Floats tab
       other.offset += dot(other.normal, neighbors.vectors(table, ROW) - first);
       const Lanes shift = other.offset / noise;
       const Lanes voted = support(patch, weights, {other.normal / within, other.offset / within});
-      const Lanes score = voted / sum[0] - float(cost) * shift * shift;
+      const Lanes score = voted / sum - float(cost) * shift * shift;
       const Flags is_better = (magnitude(shift) < float(inlier_reach)) &
                               (dot(other.normal, other.normal) > 0) & (score > highest);
       highest = where(is_better, score, highest);
@@ -201,15 +202,15 @@ KERNEL fit_paraboloids(int64_t num_points, int64_t k, int64_t num_rows, Floats p
     }
     for (int j = TERMS - 1; j >= 0; j--)
       for (int p = j + 1; p < TERMS; p++) solution[j] -= lower[p][j] * inverse[j] * solution[p];
-    const Sums<1> squares = add_up<1>(patch.width, [&](int j, Lanes* total) {
+    const Lanes square = sum_of(patch.width, [&](int j) {
       const Lanes u = us[j], v = vs[j];
       Lanes residual = heights[j] - patch.weight[j] * solution[0];
       residual -= u * solution[1], residual -= v * solution[2], residual -= u * u * solution[3];
       residual -= u * v * solution[4], residual -= v * v * solution[5];
-      *total += residual * residual;
+      return residual * residual;
     });
     const Lanes freedom = larger(*sum - TERMS, all(1));
-    eight.write(roots_of(squares[0] / freedom) * radius, deviations);
+    eight.write(roots_of(square / freedom) * radius, deviations);
     const Lanes slope_u = solution[1], slope_v = solution[2];
     const Lanes length = roots_of(1 + slope_u * slope_u + slope_v * slope_v);
     eight.write((normal - slope_u * first - slope_v * second) / length, tilted);
