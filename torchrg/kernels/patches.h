@@ -191,7 +191,7 @@ INLINE void gather(const Lists& lists, const Rows& rows, Patch& patch) {
         if (j == 0) first[axis] = found[axis];
         patch.columns[axis].set_half(j, half, found[axis] - first[axis]);
       }
-      patch.weight.set(j, all(1));
+      patch.weight.set_half(j, half, FourFloats{} + 1);
     }
   }
   for (int j = 0; lists.mask && j < k; j++) {
