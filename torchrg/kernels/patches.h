@@ -152,18 +152,6 @@ INLINE void transpose(FourFloats (&rows)[4]) {
   rows[2] = SHUFFLED(c, d, 0, 1, 4, 5), rows[3] = SHUFFLED(c, d, 2, 3, 6, 7);
 }
 
-// Whether the lists of rows have valid indices; fetches the lists of the next rows into the cache.
-INLINE bool are_lists(const Lists& lists, const Rows& rows) {
-  constexpr int LINE = 16;
-  const int64_t k = lists.k;
-  for (int64_t j = 0; j < LANES * k; j += LINE)
-    __builtin_prefetch(lists.indices + (rows.numbers[LANES - 1] + 1) * k + j);
-  bool inside = true;
-  for (int64_t number : rows.numbers)
-    inside &= are_rows(lists.indices + number * k, k, lists.num_points);
-  return inside;
-}
-
 // Gathers `size` adjacent numbers, 3 or 4, of the neighbors of one rank of four rows.
 template <int size>
 INLINE void gather_four(Floats values, int num_columns, Ints indices, int64_t k,
@@ -205,9 +193,16 @@ INLINE void gather(const Lists& lists, const Rows& rows, Patch& patch) {
 template <class Visit>
 INLINE int64_t visit_rows(const Lists& lists, Longs rows, int64_t n, const Visit& visit) {
   if (lists.k < 1 || lists.k > MAX_WIDTH) return TOO_WIDE;
+  constexpr int LINE = 16;  // indices in a line of the cache
   Rows eight;
   for (int64_t q = 0; q < n; q += LANES) {
-    if (!eight.set(rows, q, n, lists.num_lists) || !are_lists(lists, eight)) return NO_SUCH_ROW;
+    if (!eight.set(rows, q, n, lists.num_lists)) return NO_SUCH_ROW;
+    const Ints next = lists.indices + (eight.numbers[LANES - 1] + 1) * lists.k;
+    for (int64_t j = 0; j < LANES * lists.k; j += LINE) __builtin_prefetch(next + j);
+    bool inside = true;
+    for (int64_t number : eight.numbers)
+      inside &= are_rows(lists.indices + number * lists.k, lists.k, lists.num_points);
+    if (!inside) return NO_SUCH_ROW;
     visit(eight);
   }
   return DONE;
