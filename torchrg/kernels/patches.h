@@ -355,10 +355,11 @@ static Fits decompose(const Sums<6>& covariances) {
   return {Planes{{found[0], found[1], found[2]}}, found[3], found[4], found[5], Lanes{}};
 }
 
-// Adds the products xx xy xz yy yz zz of two vectors.
-INLINE void add_products(const Vectors& a, const Vectors& b, Lanes* sum) {
-  sum[0] += a.x * b.x, sum[1] += a.x * b.y, sum[2] += a.x * b.z;
-  sum[3] += a.y * b.y, sum[4] += a.y * b.z, sum[5] += a.z * b.z;
+// Adds the products xx xy xz yy yz zz of weighted vectors.
+INLINE void add_products(Lanes weight, const Vectors& a, Lanes* sum) {
+  const Lanes wx = weight * a.x, wy = weight * a.y;
+  sum[0] += wx * a.x, sum[1] += wx * a.y, sum[2] += wx * a.z;
+  sum[3] += wy * a.y, sum[4] += wy * a.z, sum[5] += weight * a.z * a.z;
 }
 INLINE void add(const Vectors& a, Lanes* sum) { sum[0] += a.x, sum[1] += a.y, sum[2] += a.z; }
 
@@ -375,10 +376,8 @@ INLINE Moments moments(const Patch& patch, const Column& weights, int width) {
   });
   const Lanes inverse = 1 / or_one(sums[0]);
   const Vectors mean = inverse * Vectors{sums[1], sums[2], sums[3]};
-  const Sums<6> covariance = add_up<6>(width, [&](int j, Lanes* sum) {
-    const Vectors away = patch[j] - mean;
-    add_products(weights[j] * inverse * away, away, sum);
-  });
+  const Sums<6> covariance = add_up<6>(
+      width, [&](int j, Lanes* sum) { add_products(weights[j] * inverse, patch[j] - mean, sum); });
   return {sums[0], mean, covariance};
 }
 
