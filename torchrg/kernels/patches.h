@@ -355,12 +355,6 @@ static Fits decompose(const Sums<6>& covariances) {
   return {Planes{{found[0], found[1], found[2]}}, found[3], found[4], found[5], Lanes{}};
 }
 
-// Adds the products xx xy xz yy yz zz of weighted vectors.
-INLINE void add_products(Lanes weight, const Vectors& a, Lanes* sum) {
-  const Lanes wx = weight * a.x, wy = weight * a.y;
-  sum[0] += wx * a.x, sum[1] += wx * a.y, sum[2] += wx * a.z;
-  sum[3] += wy * a.y, sum[4] += wy * a.z, sum[5] += weight * a.z * a.z;
-}
 INLINE void add(const Vectors& a, Lanes* sum) { sum[0] += a.x, sum[1] += a.y, sum[2] += a.z; }
 
 // Weight sums, means and covariances of patches with nonnegative weights.
@@ -376,8 +370,14 @@ INLINE Moments moments(const Patch& patch, const Column& weights, int width) {
   });
   const Lanes inverse = 1 / or_one(sums[0]);
   const Vectors mean = inverse * Vectors{sums[1], sums[2], sums[3]};
-  const Sums<6> covariance = add_up<6>(
-      width, [&](int j, Lanes* sum) { add_products(weights[j] * inverse, patch[j] - mean, sum); });
+  const Sums<6> covariance = add_up<6>(width, [&](int j, Lanes* sum) {
+    // By components: the library for any processor runs out of registers for vectors.
+    const Lanes x = patch.columns[0][j] - mean.x, y = patch.columns[1][j] - mean.y;
+    const Lanes z = patch.columns[2][j] - mean.z;
+    const Lanes scaled = weights[j] * inverse, wx = scaled * x, wy = scaled * y;
+    sum[0] += wx * x, sum[1] += wx * y, sum[2] += wx * z;
+    sum[3] += wy * y, sum[4] += wy * z, sum[5] += scaled * z * z;
+  });
   return {sums[0], mean, covariance};
 }
 

@@ -70,10 +70,12 @@ KERNEL smooth_planes(int64_t num_points, int64_t k, int64_t num_rows, Floats tab
       weight *= positive(1 - ratio * ratio);
       weight *= 1 - float(falloff) * dot(arm, arm) / far;
       if (mask) weight = where(eight.flags(mask, k, j), weight, all(0));
-      const Vectors unit = arm / radius;
+      const Vectors unit = arm / radius, scaled = weight * unit;
       near.points.set(j, unit), near.offsets.set(j, residual);
       weights.set(j, weight), signs.set(j, side_where(cosine >= 0));
-      add(weight * unit, sum), add_products(weight, unit, sum + 3);
+      add(scaled, sum);
+      sum[3] += scaled.x * unit.x, sum[4] += scaled.x * unit.y, sum[5] += scaled.x * unit.z;
+      sum[6] += scaled.y * unit.y, sum[7] += scaled.y * unit.z, sum[8] += scaled.z * unit.z;
     });
     // smoothing._recenter_weights: Cramer's rule for the tilt that moves the mean to the point.
     const Lanes added = float(ridge) * (s[3] + s[6] + s[8]);
