@@ -272,6 +272,13 @@ def test_few_or_equal_points_are_one_superpoint(count):
     assert make_superpoints(torch.full((4, 3), torch.nan)).labels.tolist() == [-1] * 4
 
 
+def test_equal_points_of_a_grid_are_one_superpoint_without_kernels(monkeypatch):
+    monkeypatch.setattr(superpoints.kernels, "serve", lambda *_, **__: False)
+    floor = torch.cartesian_prod(torch.arange(12.0), torch.arange(12.0), torch.arange(1.0))
+    parts = make_superpoints(floor, segment_planes(floor, "classic"))
+    assert all(level.tolist() == [0] * len(floor) for level in (parts.labels, *parts.levels))
+
+
 def test_an_island_without_neighbours_stays_small(rng):
     points, normals, planes = crumpled(rng)
     points[:9] += 50.0

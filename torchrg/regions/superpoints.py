@@ -404,6 +404,8 @@ def _aggregate(a: Tensor, b: Tensor, contacts: Tensor | None, difference: Tensor
     contacts = torch.ones_like(difference) if contacts is None else contacts
     different = nonzero_rows(a != b)
     a, b, contacts, difference = (part[different] for part in (a, b, contacts, difference))
+    if len(a) == 0:
+        return _Boundaries(a, b, contacts, difference)
     a, b = a.long(), b.long()
     keys, order = (torch.minimum(a, b) * width + torch.maximum(a, b)).sort(stable=True)
     keys, counts = torch.unique_consecutive(keys, return_counts=True)
