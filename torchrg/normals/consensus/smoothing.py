@@ -6,7 +6,13 @@ import torch
 from torch import Tensor
 
 from torchrg import kernels, scratch
-from torchrg._parallel import ROWS_IN_CACHE, limit_rows, map_chunks, map_selected
+from torchrg._parallel import (
+    ROWS_AT_ONCE,
+    ROWS_IN_CACHE,
+    limit_rows,
+    map_chunks,
+    map_selected,
+)
 from torchrg.linalg.angles import signs
 from torchrg.linalg.moments import (
     Columns,
@@ -76,7 +82,13 @@ def _replace_planes(
 def _table(points: Tensor, planes: TangentPlanes, values: Tensor) -> Tensor:
     """Return rows of point, normal, offset and value ``(N, 8)``, contiguous per point."""
     columns = points, planes.normals, planes.offsets[:, None], values[:, None]
-    return torch.cat(columns, dim=1, out=scratch.new_empty(points, (len(points), 8)))
+    table = scratch.new_empty(points, (len(points), 8))
+
+    def work(rows: slice) -> None:
+        torch.cat([column[rows] for column in columns], dim=1, out=table[rows])
+
+    map_chunks(work, len(points), ROWS_AT_ONCE, points.device)
+    return table
 
 
 def _smooth_rows(
