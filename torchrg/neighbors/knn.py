@@ -292,13 +292,13 @@ def prepare_search(points: NDArray[np.floating], k: int) -> SomeNeighbors:
 
     @sequential_operations()
     def search(rows: NDArray[np.integer]) -> NDArray[np.integer]:
-        requested, places = np.unique(rows, return_inverse=True)
+        requested, indices = np.unique(rows, return_inverse=True)
         found = np.empty((len(requested), k), dtype=np.int32)
         pending = search_grids(grids, requested, found, np.arange(len(requested)))
         if len(pending):
             at = np.searchsorted(requested, pending)
             found[at] = _query(tree(), positions[pending], k)[1]
-        return found[places]
+        return found[indices]
 
     return search
 
