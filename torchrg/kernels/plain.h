@@ -49,7 +49,7 @@ struct Pair {
 #define ON_BOTH_ASSIGN(operation) \
   ON_BOTH(Pair, operation)        \
   friend INLINE_MEMBER Pair& operator operation## = (Pair & a, Pair b) { return a = a operation b; }
-  typedef Pair<int32_t, FourFlags> Truth;
+  typedef Pair<int32_t, FourFlags> Compared;
   ON_BOTH_ASSIGN(+)
   ON_BOTH_ASSIGN(-)
   ON_BOTH_ASSIGN(*)
@@ -58,11 +58,11 @@ struct Pair {
   ON_BOTH_ASSIGN(|)
   ON_BOTH(Pair, ^)
   ON_BOTH(Pair, >>)
-  ON_BOTH(Truth, <)
-  ON_BOTH(Truth, <=)
-  ON_BOTH(Truth, >)
-  ON_BOTH(Truth, >=)
-  ON_BOTH(Truth, ==)
+  ON_BOTH(Compared, <)
+  ON_BOTH(Compared, <=)
+  ON_BOTH(Compared, >)
+  ON_BOTH(Compared, >=)
+  ON_BOTH(Compared, ==)
 };
 typedef Pair<float, FourFloats> Lanes;
 typedef Pair<int32_t, FourFlags> Flags;
@@ -170,7 +170,7 @@ INLINE bool is_row(int64_t number, int64_t num_rows) {
 // Whether all numbers are.
 template <class T>
 INLINE bool are_rows(const T* numbers, int64_t count, int64_t num_rows) {
-  const int64_t most = sizeof(T) == 4 ? INT32_MAX : INT64_MAX, last = smaller(num_rows - 1, most);
+  const int64_t limit = sizeof(T) == 4 ? INT32_MAX : INT64_MAX, last = smaller(num_rows - 1, limit);
   T wrong = 0;  // in its sign, without a branch
   for (int64_t j = 0; j < count; j++)
     wrong |= numbers[j] | T(uint64_t(last) - uint64_t(numbers[j]));

@@ -31,7 +31,7 @@ INLINE void gather_near(Floats table, const Lists& lists, const Rows& rows, Tabl
       }
 }
 
-INLINE Planes own_planes(Floats table, const Rows& rows) {
+INLINE Planes read_planes(Floats table, const Rows& rows) {
   return {rows.vectors(table, ROW, NORMAL), rows.of(table, ROW, OFFSET)};
 }
 
@@ -49,7 +49,7 @@ KERNEL smooth_planes(int64_t num_points, int64_t k, int64_t num_rows, Floats tab
   const float sq_agreement = float(agreement * agreement);
   return visit_rows(lists, rows, num_rows, [&](const Rows& eight) {
     gather_near(table, lists, eight, near);
-    const Planes own = own_planes(table, eight);
+    const Planes input = read_planes(table, eight);
     const Lanes sq_first = near.numbers[0] * near.numbers[0];
     const Vectors first = near.points[0];
     Lanes sq_radius{};
@@ -62,7 +62,7 @@ KERNEL smooth_planes(int64_t num_points, int64_t k, int64_t num_rows, Floats tab
     const Sums<9> s = add_up<9>(width, [&](int j, Lanes* sum) {
       const Vectors arm = near.points[j], normal = near.normals[j];
       const Lanes sq_error = near.numbers[j] * near.numbers[j];
-      const Lanes cosine = dot(normal, own.normal);
+      const Lanes cosine = dot(normal, input.normal);
       const Lanes residual = -dot(normal, arm) - near.offsets[j], ratio = residual / within;
       const Lanes sq_angle = sq_agreement * (sq_error + sq_first);
       Lanes weight = positive(1 - 2 * (1 - magnitude(cosine)) / sq_angle);
@@ -98,7 +98,7 @@ KERNEL smooth_planes(int64_t num_points, int64_t k, int64_t num_rows, Floats tab
     const Vectors normal = {sums[0], sums[1], sums[2]};
     const Lanes length = roots_of(dot(normal, normal));
     const Planes smoothed = {normal / length, -sums[3] / sums[4]};
-    choose(length > 0, smoothed, own).write(eight, normals, offsets);
+    choose(length > 0, smoothed, input).write(eight, normals, offsets);
   });
 }
 
@@ -119,12 +119,12 @@ KERNEL choose_planes(int64_t num_points, int64_t k, int64_t num_rows, Floats tab
       return weight;
     });
     const Lanes noise = eight.of(table, ROW, NUMBER), within = float(vote_reach) * noise;
-    Planes best = own_planes(table, eight);
+    Planes best = read_planes(table, eight);
     Lanes highest = all(-INFINITE);
     const Vectors first = eight.neighbors(indices, k, 0).vectors(table, ROW);
     for (int64_t rank = 0; rank < k; rank += step) {
       const Rows neighbors = eight.neighbors(indices, k, rank);
-      Planes other = own_planes(table, neighbors);
+      Planes other = read_planes(table, neighbors);
       other.offset += dot(other.normal, neighbors.vectors(table, ROW) - first);
       const Lanes shift = other.offset / noise;
       const Lanes voted = support(patch, weights, {other.normal / within, other.offset / within});
