@@ -254,18 +254,17 @@ def connected_components(
 def _double_cover(
     num_nodes: int, starts: Tensor, ends: Tensor, flips: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return each node's first connected node, whether it is flipped, and whether links disagree.
+    """Return each node's component, whether it is flipped, and whether links disagree.
 
-    The double cover contains each node with both signs.
+    The double cover contains each node with both signs. Components ascend with their first nodes.
     """
+    from scipy.sparse import coo_array, csgraph
+
     other = num_nodes * flips
-    starts = torch.cat([starts, starts + num_nodes]).long()
-    ends = torch.cat([ends + other, ends + num_nodes - other]).long()
-    first, last = torch.arange(2 * num_nodes), None
-    while last is None or not torch.equal(first, last):
-        last, low = first, torch.minimum(first[starts], first[ends])
-        for side in (starts, ends):
-            first = first.scatter_reduce(0, side, low, "amin")
-        first = first[first]
-    upright, opposite = first.view(2, num_nodes)
+    starts = torch.cat([starts, starts + num_nodes])
+    ends = torch.cat([ends + other, ends + num_nodes - other])
+    links = np.ones(len(starts)), (starts.numpy(), ends.numpy())
+    cover = coo_array(links, shape=(2 * num_nodes, 2 * num_nodes))
+    numbers = torch.from_numpy(csgraph.connected_components(cover, directed=False)[1])
+    upright, opposite = numbers.view(2, num_nodes)
     return torch.minimum(upright, opposite), upright > opposite, upright == opposite
