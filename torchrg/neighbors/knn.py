@@ -349,8 +349,9 @@ def search_rows(
 class _Grid(NamedTuple):
     """Points in the cells of a grid around their bounding box.
 
-    Their coordinates, and rows by cell; first of these of each cell, then the number of points;
-    cells along y and z, lower corner x, y, z, and cell size.
+    Coordinates of the points, and their rows sorted by cell. ``starts`` has the first index of each
+    cell in ``rows``, then the number of points. ``shape`` is the number of cells along y and z,
+    the lower corner x, y, z, and the cell size.
     """
 
     points: Tensor

@@ -168,7 +168,7 @@ class _Contacts(NamedTuple):
 class _RegionEdges:
     """Edges between regions, found again on each pass: storing all could take more than the cloud.
 
-    Those of a single chunk of points are kept. ``pairs`` ``(E, 2)`` are the adjacent regions,
+    Edges of a cloud of one chunk are stored. ``pairs`` ``(E, 2)`` are the adjacent regions,
     ascending, and ``counts`` ``(E,)`` their edges.
     """
 
